@@ -1,0 +1,56 @@
+"""Multi-agent path planning on walled grids: a PettingZoo environment, batched, with its optimum.
+
+The system of Çetinkaya, "Multi-Agent Path Planning Using Deep Reinforcement Learning",
+arXiv 2110.01460. Importing this module registers the environments with PettingZoo (where it has a
+registry) and Gymnasium, and loads neither torch nor any drawing library.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+import pettingzoo
+
+from mapp_env import mapp_v0
+from mapp_env.grid import Grid
+from mapp_env.grids import grid_names, make_grid
+from mapp_env.map_format import MapError
+from mapp_env.plan import Plan, replay
+from mapp_env.problem import Problem, sample_problems
+from mapp_env.vector_env import make_vec
+
+__all__ = [
+    "Grid",
+    "MapError",
+    "Plan",
+    "Problem",
+    "__version__",
+    "grid_names",
+    "make_grid",
+    "make_vec",
+    "mapp_v0",
+    "replay",
+    "sample_problems",
+]
+
+__version__ = "0.1.0"
+
+
+def _register() -> None:
+    """Make the environments known by name; again on a reload does nothing."""
+    if "mapp_env/Central-v0" not in gymnasium.registry:
+        gymnasium.register(
+            "mapp_env/Central-v0",
+            entry_point="mapp_env.central_env:CentralEnv",
+            vector_entry_point="mapp_env.vector_env:make_gymnasium_vec",
+        )
+    # PettingZoo has a registry from 1.27 on.
+    if hasattr(pettingzoo, "register"):
+        for kind, registry, entry_point in (
+            ("parallel", pettingzoo.parallel_registry, "mapp_env.mapp_v0:parallel_env"),
+            ("aec", pettingzoo.aec_registry, "mapp_env.mapp_v0:env"),
+        ):
+            if "mapp_env/mapp-v0" not in registry:
+                pettingzoo.register(kind, "mapp_env/mapp-v0", entry_point)
+
+
+_register()

@@ -1,0 +1,205 @@
+"""The Gymnasium face of the meta-agent: one learner that sees everything and commands every agent."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import logger
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from numpy.typing import NDArray
+
+from mapp_env.grid import Grid
+from mapp_env.observation import Observation
+from mapp_env.rendering.display import Display
+from mapp_env.simulation import Simulation
+from mapp_env.task import RENDER_MODES, Task
+from mapp_env.validation import MAX_SEED, as_integer, check_choice, check_count, describe
+
+__all__ = ["CENTRAL_ACTIONS", "MAX_JOINT_AGENTS", "CentralEnv", "central_action_space"]
+
+CENTRAL_ACTIONS = ("auto", "joint", "multi")
+
+MAX_JOINT_AGENTS = 6
+"""Largest team whose joint actions are numbered one by one (4**6 = 4096)."""
+
+
+def central_action_space(
+    task: Task, central_action: str
+) -> tuple[Discrete[np.int64] | MultiDiscrete, NDArray[np.int64] | None]:
+    """Return the meta-agent's action space and, for numbered joint actions, their table.
+
+    Parameters
+    ----------
+    task : Task
+        What is simulated.
+    central_action : {"auto", "joint", "multi"}
+        ``"joint"`` numbers the joint actions, the first agent most significant; ``"multi"`` takes
+        one action an agent; ``"auto"`` is joint up to six agents.
+
+    Returns
+    -------
+    Discrete or MultiDiscrete, and ndarray of int64, shape (A**N, N), or None
+        The space; the table holds each agent's action for each joint action.
+
+    Raises
+    ------
+    ValueError
+        If joint actions are asked for more than six agents.
+    """
+    check_choice("central_action", central_action, CENTRAL_ACTIONS)
+    n_agents, n_actions = task.n_agents, task.n_actions
+    if central_action == "joint" and n_agents > MAX_JOINT_AGENTS:
+        raise ValueError(
+            f"central_action='joint' is for at most {MAX_JOINT_AGENTS} agents, got n_agents="
+            f"{n_agents}: use 'multi'"
+        )
+    if central_action == "multi" or n_agents > MAX_JOINT_AGENTS:
+        return MultiDiscrete(np.full(n_agents, n_actions)), None
+    table = np.indices((n_actions,) * n_agents).reshape(n_agents, -1).T
+    return Discrete(n_actions**n_agents), np.ascontiguousarray(table, np.int64)
+
+
+class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
+    """The same problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
+
+    It sees what all agents see: the global observation once, or for the other kinds the agents'
+    observations stacked, shape (N, ...). ``info["action_mask"]`` is int8, shape (N, A); on the last
+    step ``info["metrics"]`` holds success, cover_time, makespan and total_distance.
+
+    Parameters
+    ----------
+    central_action : {"auto", "joint", "multi"}
+        ``"joint"``: ``Discrete(A**N)``, the first agent most significant; ``"multi"``:
+        ``MultiDiscrete``, one action an agent; ``"auto"``: joint up to six agents.
+    grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
+        As in :class:`mapp_env.parallel_env.MappParallelEnv`.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as said.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 5}  # noqa: RUF012
+
+    def __init__(
+        self,
+        grid: str | os.PathLike[str] | Grid = "paper-7x7",
+        n_agents: int = 3,
+        n_landmarks: int = 5,
+        max_cycles: int = 50,
+        reward: str = "manhattan",
+        observation: str = "global",
+        allow_wait: bool = False,
+        render_mode: str | None = None,
+        central_action: str = "auto",
+    ) -> None:
+        task = Task(
+            grid,  # type: ignore[arg-type] - a name or a path becomes a grid
+            n_agents,
+            n_landmarks,
+            max_cycles,
+            reward,
+            observation,
+            allow_wait,
+            render_mode,
+        )
+        self.task = task
+        self.render_mode = task.render_mode
+        view = task.central_view
+        self.observation_space = Box(view.low, view.high, dtype=np.float32)
+        self.action_space, self._joint_actions = central_action_space(task, central_action)
+        self._simulation = Simulation(task)
+        self._started = False
+        self._display = Display(task.render_mode, self.metadata["render_fps"])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; ``options`` as in the PettingZoo face.
+
+        Raises
+        ------
+        ValueError
+            If seed or options cannot be used.
+        """
+        if seed is not None:
+            seed = check_count("seed", seed, 0, MAX_SEED)
+        problem = self.task.check_options(options)
+        super().reset(seed=seed)
+        self._simulation.reset(problem, self.np_random)
+        self._started = True
+        if self.render_mode == "human":
+            self.render()
+        return self._observe()
+
+    def step(
+        self, action: Any
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Carry out a joint action.
+
+        Raises
+        ------
+        ValueError
+            If it is not in the action space; nothing has moved then.
+        gymnasium.error.ResetNeeded
+            If there is no episode to step.
+        """
+        if not self._simulation.running:
+            raise ResetNeeded("step() needs an episode in progress: call reset() first")
+        reward, terminated, truncated = self._simulation.step(self._read_action(action))
+        observation, info = self._observe()
+        if terminated or truncated:
+            info["metrics"] = self._simulation.metrics()
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, terminated, truncated, info
+
+    def _read_action(self, action: Any) -> NDArray[np.int64]:
+        """Return each agent's action, shape (N,)."""
+        if self._joint_actions is not None:
+            number = as_integer(action)
+            if number is None or not 0 <= number < len(self._joint_actions):
+                raise ValueError(
+                    f"action must be an integer in 0..{len(self._joint_actions) - 1}, "
+                    f"got {describe(action)}"
+                )
+            joint: NDArray[np.int64] = self._joint_actions[number]
+            return joint
+        task = self.task
+        numbers = [as_integer(one) for one in action] if np.ndim(action) == 1 else []
+        if len(numbers) != task.n_agents or not all(
+            number is not None and 0 <= number < task.n_actions for number in numbers
+        ):
+            raise ValueError(
+                f"action must hold {task.n_agents} integers in 0..{task.n_actions - 1}, one an "
+                f"agent, got {describe(action)}"
+            )
+        return np.array(numbers, np.int64)
+
+    def _observe(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        once = self.task.observation_kind == Observation.GLOBAL
+        views, masks = self._simulation.observe(1 if once else self.task.n_agents)
+        return views[0] if once else views, {"action_mask": masks}
+
+    def render(self) -> Any:
+        """Show the episode as ``render_mode`` says; see the PettingZoo face.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("render() needs an episode: call reset() first")
+        if self.render_mode is None:
+            logger.warn("render() shows nothing: make the environment with a render_mode")
+        return self._display.show(self._simulation.scene())
+
+    def close(self) -> None:
+        """Close the window, if there is one; may be called again."""
+        self._display.close()

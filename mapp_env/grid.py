@@ -1,0 +1,326 @@
+"""The grid: walls and a depot, turned once into tables so that the rules never look at a wall."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from mapp_env.map_format import MAX_SIDE, ParsedMap, parse_map, read_map
+from mapp_env.validation import as_integer, describe
+
+__all__ = ["MAX_ALL_PAIRS_CELLS", "Grid"]
+
+MAX_ALL_PAIRS_CELLS = 4096
+"""Largest number of cells for which all pairs of distances are kept (64 MiB at 4096)."""
+
+UNREACHABLE = -1
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Grid:
+    """A walled grid with a depot.
+
+    A cell is its row-major index ``row * cols + col`` (paper, section 5: "enumerated in [0, 48]").
+
+    Parameters
+    ----------
+    walls : array_like of bool, shape (rows, cols)
+        ``True`` where no agent can stand; 1 to 512 rows and columns.
+    depot : int or (int, int), optional
+        The free cell, or its row and column, where all agents start and end. By default the free
+        cell nearest to the centre (smallest index among equals).
+
+    Attributes
+    ----------
+    walls : ndarray of bool, shape (rows, cols)
+        Read-only.
+    depot : int
+        The depot's cell.
+
+    Raises
+    ------
+    ValueError
+        If ``walls`` is not a two-dimensional boolean array of allowed size with a free cell, or
+        ``depot`` is not a free cell.
+    """
+
+    walls: NDArray[np.bool_]  # (rows, cols) bool, read-only
+    depot: int = None  # type: ignore[assignment]
+
+    def __init__(self, walls: ArrayLike, depot: object = None) -> None:
+        array = np.asarray(walls)
+        if array.ndim != 2 or array.dtype != np.bool_:
+            raise ValueError(
+                "walls must be a two-dimensional array of bool, "
+                f"got shape {array.shape} and dtype {array.dtype}"
+            )
+        if not all(1 <= side <= MAX_SIDE for side in array.shape):
+            raise ValueError(
+                f"walls must have 1..{MAX_SIDE} rows and columns, got shape {array.shape}"
+            )
+        if array.all():
+            raise ValueError("walls must leave at least one free cell, got walls everywhere")
+        array = array.copy()
+        array.flags.writeable = False
+        object.__setattr__(self, "walls", array)
+        cell = self._centre() if depot is None else self.cell("depot", depot)
+        if array.flat[cell]:
+            raise ValueError(f"depot must be a free cell, got {describe(depot)}, which is a wall")
+        object.__setattr__(self, "depot", cell)
+
+    # -- reading and writing ---------------------------------------------------------------------
+
+    @classmethod
+    def from_text(cls, text: str, depot: object = None) -> Grid:
+        """Build a grid from rows of characters, plain or with a MovingAI header.
+
+        Parameters
+        ----------
+        text : str
+            ``#``, ``@``, ``T``, ``O`` are walls; ``.``, ``G`` free cells; ``D`` the depot.
+        depot : int or (int, int), optional
+            Overrides the text's depot; without either, the free cell nearest to the centre.
+
+        Raises
+        ------
+        ValueError
+            If the text is malformed; the message names the line.
+        """
+        if not isinstance(text, str):
+            raise ValueError(f"text must be a str of map rows, got {describe(text)}")
+        return cls._from_parsed(parse_map(text), depot)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], depot: object = None) -> Grid:
+        """Read a grid from a text or MovingAI ``.map`` file of at most 1 MiB.
+
+        Parameters
+        ----------
+        path : str or os.PathLike
+            The file.
+        depot : int or (int, int), optional
+            Overrides the file's depot; without either, the free cell nearest to the centre.
+
+        Raises
+        ------
+        ValueError
+            If the file cannot be opened, is not a regular file, is too large or is malformed; the
+            message names path and line.
+        """
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"path must be a str or os.PathLike, got {describe(path)}")
+        return cls._from_parsed(read_map(path), depot)
+
+    @classmethod
+    def _from_parsed(cls, parsed: ParsedMap, depot: object) -> Grid:
+        return cls(parsed.walls, parsed.depot if depot is None else depot)
+
+    def to_text(self) -> str:
+        """Return the grid as rows of ``#``, ``.`` and ``D``, which :meth:`from_text` reads back."""
+        letters = np.where(self.walls, "#", ".")
+        letters.flat[self.depot] = "D"
+        return "\n".join("".join(row) for row in letters)
+
+    # -- shape and cells ---------------------------------------------------------------------------
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return int(self.walls.shape[0])
+
+    @property
+    def cols(self) -> int:
+        """Number of columns."""
+        return int(self.walls.shape[1])
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells, walls included."""
+        return int(self.walls.size)
+
+    def cell(self, name: str, value: object) -> int:
+        """Return the cell meant by an index or a (row, col) pair.
+
+        Parameters
+        ----------
+        name : str
+            How messages call the value.
+        value : int or (int, int)
+            A cell, or its row and column.
+
+        Raises
+        ------
+        ValueError
+            If ``value`` is neither, or off the grid.
+        """
+        index = as_integer(value)
+        if index is not None and 0 <= index < self.n_cells:
+            return index
+        if index is None and isinstance(value, tuple | list | np.ndarray) and len(value) == 2:
+            row, col = as_integer(value[0]), as_integer(value[1])
+            if row is not None and col is not None:
+                if 0 <= row < self.rows and 0 <= col < self.cols:
+                    return row * self.cols + col
+        raise ValueError(
+            f"{name} must be a cell in 0..{self.n_cells - 1} or a (row, col) pair within "
+            f"{self.rows} x {self.cols}, got {describe(value)}"
+        )
+
+    def _centre(self) -> int:
+        """Return the free cell nearest to the middle of the grid."""
+        free = np.flatnonzero(~self.walls)
+        row, col = np.divmod(free, self.cols)
+        # Doubled coordinates keep the centre of an even side whole.
+        offset = (2 * row - self.rows + 1) ** 2 + (2 * col - self.cols + 1) ** 2
+        return int(free[np.argmin(offset)])
+
+    # -- tables --------------------------------------------------------------------------------------
+
+    @cached_property
+    def moves(self) -> NDArray[np.int32]:
+        """The cell that each move leads to, shape (C, 4) int32, in the order left, right, up, down.
+
+        A move into a wall or off the grid leads to the cell itself; so does every move of a wall.
+        """
+        cells = np.arange(self.n_cells, dtype=np.int32).reshape(self.walls.shape)
+        moves = np.repeat(cells[:, :, None], 4, axis=2)
+        moves[:, 1:, 0] = cells[:, :-1]
+        moves[:, :-1, 1] = cells[:, 1:]
+        moves[1:, :, 2] = cells[:-1]
+        moves[:-1, :, 3] = cells[1:]
+        blocked = self.walls.ravel()[moves] | self.walls[:, :, None]
+        return _frozen(np.where(blocked, cells[:, :, None], moves).reshape(-1, 4))
+
+    @cached_property
+    def home(self) -> NDArray[np.int32]:
+        """Steps of a shortest path from each cell to the depot, shape (C,) int32, -1 unreachable."""
+        return _frozen(self.distances_from([self.depot])[0])
+
+    @cached_property
+    def reachable(self) -> NDArray[np.int32]:
+        """Cells where a landmark may stand, ascending, shape (F,) int32 (rule R2)."""
+        return _frozen(np.flatnonzero(self.home > 0).astype(np.int32))
+
+    @cached_property
+    def distances(self) -> NDArray[np.int32]:
+        """Steps of a shortest path between all pairs of cells, shape (C, C) int32, -1 unreachable.
+
+        Raises
+        ------
+        ValueError
+            If the grid has more than 4096 cells; use :meth:`distances_from` then.
+        """
+        if self.n_cells > MAX_ALL_PAIRS_CELLS:
+            raise ValueError(
+                f"distances between all pairs are kept for at most {MAX_ALL_PAIRS_CELLS} cells, "
+                f"this grid has {self.n_cells}: use distances_from(cells)"
+            )
+        return _frozen(self.distances_from(range(self.n_cells)))
+
+    def distances_from(self, cells: Iterable[int]) -> NDArray[np.int32]:
+        """Return the steps of a shortest path from each of ``cells`` to every cell.
+
+        Parameters
+        ----------
+        cells : iterable of int, length S
+            The starting cells; from a wall nothing is reachable.
+
+        Returns
+        -------
+        ndarray of int32, shape (S, C)
+            -1 where there is no path.
+
+        Raises
+        ------
+        ValueError
+            If a cell is off the grid.
+        """
+        starts = np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
+        fields = np.empty((len(starts), self.n_cells), dtype=np.int32)
+        queue = np.empty(self.n_cells, dtype=np.int32)
+        walls = self.walls.ravel()
+        for index, start in enumerate(starts):
+            if walls[start]:
+                fields[index] = UNREACHABLE
+            else:
+                fill_distances(self.moves, start, fields[index], queue)
+        return fields
+
+    def path(self, start: int, goal: int) -> tuple[int, ...]:
+        """Return a shortest path, both ends included; among equals the first in action order.
+
+        Raises
+        ------
+        ValueError
+            If a cell is off the grid or there is no path.
+        """
+        cell, end = self.cell("start", start), self.cell("goal", goal)
+        steps = self.home if end == self.depot else self.distances_from([end])[0]
+        if steps[cell] == UNREACHABLE:
+            raise ValueError(f"there is no path from start {start} to goal {goal}")
+        path = [cell]
+        while cell != end:
+            cell = next(int(to) for to in self.moves[cell] if steps[to] == steps[cell] - 1)
+            path.append(cell)
+        return tuple(path)
+
+    # -- identity ------------------------------------------------------------------------------------
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Grid):
+            return NotImplemented
+        return self.depot == other.depot and np.array_equal(self.walls, other.walls)
+
+    def __hash__(self) -> int:
+        return hash((self.walls.shape, self.walls.tobytes(), self.depot))
+
+    def __repr__(self) -> str:
+        return (
+            f"Grid(rows={self.rows}, cols={self.cols}, depot={self.depot}, "
+            f"walls={int(self.walls.sum())})"
+        )
+
+
+@njit(cache=True)
+def fill_distances(
+    moves: NDArray[np.int32],
+    start: int,
+    steps: NDArray[np.int32],
+    queue: NDArray[np.int32],
+) -> None:
+    """Breadth-first search: write the steps from ``start`` to every cell into ``steps``.
+
+    Parameters
+    ----------
+    moves : ndarray of int32, shape (C, >= 4)
+        Next cell of each move.
+    start : int
+        A free cell.
+    steps, queue : ndarray of int32, shape (C,)
+        The result, -1 where unreachable, and scratch space.
+    """
+    steps[:] = -1
+    steps[start] = 0
+    queue[0] = start
+    head = 0
+    tail = 1
+    while head < tail:
+        cell = queue[head]
+        head += 1
+        for action in range(4):
+            to = moves[cell, action]
+            if steps[to] < 0:
+                steps[to] = steps[cell] + 1
+                queue[tail] = to
+                tail += 1
+
+
+def _frozen(array: NDArray[np.int32]) -> NDArray[np.int32]:
+    array.flags.writeable = False
+    return array

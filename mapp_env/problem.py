@@ -1,0 +1,249 @@
+"""One problem: a grid, the landmarks on it and how many agents there are; and drawing them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mapp_env.grid import Grid
+from mapp_env.validation import check_count, describe
+
+__all__ = [
+    "MAX_AGENTS",
+    "MAX_CYCLES",
+    "MAX_LANDMARKS",
+    "Problem",
+    "check_grid",
+    "check_landmarks",
+    "sample_problems",
+]
+
+MAX_AGENTS = 16
+MAX_LANDMARKS = 64
+MAX_CYCLES = 1_000_000
+
+LOW_32_BITS = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be solved: visit every landmark with a team that starts and ends at the depot.
+
+    Parameters
+    ----------
+    grid : Grid
+        The grid with its depot.
+    landmarks : sequence of int or of (int, int)
+        1 to 64 distinct cells, or their rows and columns: free, reachable from the depot and not
+        the depot (rule R2). Their order is kept.
+    n_agents : int
+        1 to 16.
+    max_cycles : int, optional
+        Step limit of an episode on this problem; without it, the environment's own.
+
+    Raises
+    ------
+    ValueError
+        If any of them is not as said; the message names argument, value and what is allowed.
+    """
+
+    grid: Grid
+    landmarks: tuple[int, ...]
+    n_agents: int = 3
+    max_cycles: int | None = None
+
+    def __post_init__(self) -> None:
+        check_grid("grid", self.grid)
+        object.__setattr__(self, "landmarks", check_landmarks(self.grid, self.landmarks))
+        object.__setattr__(self, "n_agents", check_count("n_agents", self.n_agents, 1, MAX_AGENTS))
+        if self.max_cycles is not None:
+            limit = check_count("max_cycles", self.max_cycles, 1, MAX_CYCLES)
+            object.__setattr__(self, "max_cycles", limit)
+
+
+def check_grid(name: str, value: object) -> Grid:
+    """Return ``value`` if it is a grid on which a landmark can stand.
+
+    Raises
+    ------
+    ValueError
+        If it is not a :class:`Grid`, or nothing but the depot can be reached.
+    """
+    if not isinstance(value, Grid):
+        raise ValueError(f"{name} must be a mapp_env.Grid, got {describe(value)}")
+    if value.reachable.size == 0:
+        raise ValueError(f"{name} must have a free cell reachable from its depot, got {value!r}")
+    return value
+
+
+def check_landmarks(
+    grid: Grid, landmarks: object, count: int | None = None, name: str = "landmarks"
+) -> tuple[int, ...]:
+    """Return ``landmarks`` as a tuple of cells that satisfy rule R2.
+
+    Parameters
+    ----------
+    grid : Grid
+        The grid they stand on.
+    landmarks : sequence of int or of (int, int)
+        The cells, or their rows and columns.
+    count : int, optional
+        How many there must be; by default any number from 1 to 64.
+    name : str
+        How messages call the argument.
+
+    Raises
+    ------
+    ValueError
+        If the number is wrong, or a cell is off the grid, a wall, the depot, unreachable or named
+        twice.
+    """
+    if not isinstance(landmarks, Sequence | np.ndarray) or isinstance(landmarks, str | bytes):
+        raise ValueError(
+            f"{name} must be a sequence of cells or of (row, col) pairs, got {describe(landmarks)}"
+        )
+    low, high = (1, MAX_LANDMARKS) if count is None else (count, count)
+    number = len(landmarks) if np.ndim(landmarks) or not isinstance(landmarks, np.ndarray) else 0
+    if not low <= number <= high:
+        allowed = f"1..{MAX_LANDMARKS}" if count is None else str(count)
+        raise ValueError(f"{name} must hold {allowed} cells, got {describe(landmarks)}")
+    cells: list[int] = []
+    for index, value in enumerate(landmarks):
+        label = f"{name}[{index}]"
+        cell = grid.cell(label, value)
+        if grid.walls.flat[cell]:
+            raise ValueError(f"{label} must be a free cell, got {describe(value)}, a wall")
+        if cell == grid.depot:
+            raise ValueError(f"{label} must not be the depot, got {describe(value)}")
+        if grid.home[cell] < 0:
+            raise ValueError(f"{label} must be reachable from the depot, got {describe(value)}")
+        if cell in cells:
+            raise ValueError(f"{label} must differ from the others, got {describe(value)} twice")
+        cells.append(cell)
+    return tuple(cells)
+
+
+def sample_problems(
+    grid: Grid,
+    n_problems: int,
+    n_landmarks: int = 5,
+    seed: int = 0,
+    exclude: Iterable[Sequence[int]] = (),
+) -> NDArray[np.int32]:
+    """Draw distinct problems of a grid, each equally likely.
+
+    Parameters
+    ----------
+    grid : Grid
+        The grid.
+    n_problems, n_landmarks : int
+        How many problems, and landmarks in each.
+    seed : int
+        Seed of the draw.
+    exclude : iterable of sequence of int
+        Landmark sets to leave out, in any order: the problems something was trained on, say.
+
+    Returns
+    -------
+    ndarray of int32, shape (n_problems, n_landmarks)
+        Landmark cells, ascending in each row; no two rows are equal.
+
+    Raises
+    ------
+    ValueError
+        If there are not that many problems.
+    """
+    check_grid("grid", grid)
+    check_count("n_landmarks", n_landmarks, 1, MAX_LANDMARKS)
+    check_count("n_problems", n_problems, 1, 10_000_000)
+    check_count("seed", seed, 0, 2**63 - 1)
+    seen = {tuple(sorted(int(cell) for cell in landmarks)) for landmarks in exclude}
+    total = math.comb(grid.reachable.size, n_landmarks)
+    if n_problems > total - len(seen):
+        raise ValueError(
+            f"n_problems must be at most {total - len(seen)}, the number of problems with "
+            f"{n_landmarks} landmarks on this grid that are not excluded; got {n_problems}"
+        )
+    rng = np.random.default_rng(seed)
+    if total <= 4 * (n_problems + len(seen)):
+        # So few problems that drawing until enough distinct ones turn up could take long.
+        every = combinations(grid.reachable.tolist(), n_landmarks)
+        left = np.array([landmarks for landmarks in every if landmarks not in seen], np.int32)
+        return left[rng.permutation(len(left))[:n_problems]]
+    problems = np.empty((n_problems, n_landmarks), dtype=np.int32)
+    drawn = np.empty(n_landmarks, dtype=np.int32)
+    for row in problems:
+        while True:
+            draw_landmarks(rng.integers(2**64, dtype=np.uint64), grid.reachable, drawn)
+            landmarks = tuple(drawn.tolist())
+            if landmarks not in seen:
+                break
+        seen.add(landmarks)
+        row[:] = drawn
+    return problems
+
+
+@njit(cache=True)
+def draw_landmarks(
+    word: np.uint64, candidates: NDArray[np.int32], out: NDArray[np.int32]
+) -> None:
+    """Choose distinct cells, every set equally likely, as a function of one random word.
+
+    Floyd's sampling (Bentley and Floyd 1987, doi:10.1145/30401.315746), then sorted: landmarks are
+    a set, and a set should have one observation, not ``K!``.
+
+    Parameters
+    ----------
+    word : uint64
+        The only source of randomness, uniform. One word an episode lets each row of a batch draw
+        from its own ``numpy.random.Generator`` without calling it from compiled code.
+    candidates : ndarray of int32, shape (F,)
+        Cells to choose from, ascending.
+    out : ndarray of int32, shape (K,), K <= F
+        The chosen cells, ascending.
+    """
+    high = np.int64(word >> np.uint64(32))
+    low = np.int64(word & np.uint64(LOW_32_BITS))
+    count = out.shape[0]
+    first = candidates.shape[0] - count
+    used = 0
+    for chosen in range(count):
+        last = first + chosen
+        # Uniform in 0..last: of the 2**32 values of `bits`, those past the last full multiple of
+        # the range are drawn again.
+        span = last + 1
+        limit = (LOW_32_BITS + 1) // span * span
+        bits = limit
+        while bits >= limit:
+            bits = _scramble(_scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
+            used += 1
+        pick = bits % span
+        for earlier in range(chosen):
+            if out[earlier] == pick:
+                pick = last
+        # `out` holds ranks, ascending, until the end.
+        place = chosen
+        while place > 0 and out[place - 1] > pick:
+            out[place] = out[place - 1]
+            place -= 1
+        out[place] = pick
+    for index in range(count):
+        out[index] = candidates[out[index]]
+
+
+@njit(cache=True)
+def _scramble(state: int) -> int:
+    """Return a 32-bit permutation of ``state`` (PCG RXS-M-XS; O'Neill 2014, HMC-CS-2014-0905).
+
+    Written in 64-bit signed arithmetic that never overflows, so that it means the same with and
+    without compilation.
+    """
+    state = (state * 747796405 + 2891336453) & LOW_32_BITS
+    state = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & LOW_32_BITS
+    return (state >> 22) ^ state

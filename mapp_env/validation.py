@@ -1,0 +1,77 @@
+"""Checks of what users pass in: every refusal names the argument, its value and what is allowed."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+__all__ = ["MAX_SEED", "as_integer", "check_choice", "check_count", "check_flag", "describe"]
+
+MAX_SEED = 2**128 - 1
+
+
+def describe(value: object, limit: int = 80) -> str:
+    """Return ``repr(value)``, cut so that a message stays readable whatever was passed."""
+    if isinstance(value, np.ndarray) and value.size > 16:
+        return f"array of shape {value.shape} and dtype {value.dtype}"
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."
+
+
+def as_integer(value: object) -> int | None:
+    """Return ``value`` as an ``int``, or ``None`` if it is not a whole number by its type.
+
+    Booleans and floats (even ``2.0``) are not: a count that went through arithmetic is more often
+    a mistake than a wish.
+    """
+    if isinstance(value, bool | np.bool_):
+        return None
+    try:
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return None
+
+
+def check_count(name: str, value: object, low: int, high: int) -> int:
+    """Return ``value`` as an ``int`` between ``low`` and ``high``, both included.
+
+    Raises
+    ------
+    ValueError
+        If ``value`` is not an integer (booleans and floats are not) or out of range.
+    """
+    number = as_integer(value)
+    if number is None or not low <= number <= high:
+        raise ValueError(f"{name} must be an integer in {low}..{high}, got {describe(value)}")
+    return number
+
+
+def check_choice(name: str, value: object, allowed: Iterable[str | None]) -> Any:
+    """Return ``value`` if it is one of ``allowed``.
+
+    Raises
+    ------
+    ValueError
+        If it is not; the message lists what is allowed.
+    """
+    options: Sequence[str | None] = tuple(allowed)
+    if (value is None or isinstance(value, str)) and value in options:
+        return value
+    listed = ", ".join(repr(option) for option in options)
+    raise ValueError(f"{name} must be one of {listed}; got {describe(value)}")
+
+
+def check_flag(name: str, value: object) -> bool:
+    """Return ``value`` if it is ``True`` or ``False``.
+
+    Raises
+    ------
+    ValueError
+        If ``value`` is anything else, numbers included.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {describe(value)}")
+    return bool(value)
