@@ -1,4 +1,4 @@
-"""The Gymnasium face of the meta-agent: one learner that sees everything and commands every agent."""
+"""The Gymnasium face of the meta-agent: one learner sees everything and commands every agent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mapp_env.grid import Grid
 from mapp_env.observation import Observation
 from mapp_env.rendering.display import Display
 from mapp_env.simulation import Simulation
-from mapp_env.task import RENDER_MODES, Task
+from mapp_env.task import RENDER_MODES, Task, find_grid
 from mapp_env.validation import MAX_SEED, as_integer, check_choice, check_count, describe
 
 __all__ = ["CENTRAL_ACTIONS", "MAX_JOINT_AGENTS", "CentralEnv", "central_action_space"]
@@ -64,7 +64,7 @@ def central_action_space(
 
 
 class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
-    """The same problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
+    """The problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
 
     It sees what all agents see: the global observation once, or for the other kinds the agents'
     observations stacked, shape (N, ...). ``info["action_mask"]`` is int8, shape (N, A); on the last
@@ -99,7 +99,7 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         central_action: str = "auto",
     ) -> None:
         task = Task(
-            grid,  # type: ignore[arg-type] - a name or a path becomes a grid
+            find_grid(grid),
             n_agents,
             n_landmarks,
             max_cycles,
@@ -113,7 +113,8 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         view = task.central_view
         self.observation_space = Box(view.low, view.high, dtype=np.float32)
         self.action_space, self._joint_actions = central_action_space(task, central_action)
-        self._simulation = Simulation(task)
+        self._once = task.observation_kind == Observation.GLOBAL
+        self._simulation = Simulation(task, 1 if self._once else task.n_agents)
         self._started = False
         self._display = Display(task.render_mode, self.metadata["render_fps"])
 
@@ -135,11 +136,10 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         self._started = True
         if self.render_mode == "human":
             self.render()
-        return self._observe()
+        views, masks = self._simulation.observe()
+        return self._seen(views), {"action_mask": masks}
 
-    def step(
-        self, action: Any
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out a joint action.
 
         Raises
@@ -151,13 +151,14 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         """
         if not self._simulation.running:
             raise ResetNeeded("step() needs an episode in progress: call reset() first")
-        reward, terminated, truncated = self._simulation.step(self._read_action(action))
-        observation, info = self._observe()
+        joint_action = self._read_action(action)
+        reward, terminated, truncated, views, masks = self._simulation.step(joint_action)
+        info: dict[str, Any] = {"action_mask": masks}
         if terminated or truncated:
             info["metrics"] = self._simulation.metrics()
         if self.render_mode == "human":
             self.render()
-        return observation, reward, terminated, truncated, info
+        return self._seen(views), reward, terminated, truncated, info
 
     def _read_action(self, action: Any) -> NDArray[np.int64]:
         """Return each agent's action, shape (N,)."""
@@ -181,10 +182,9 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
             )
         return np.array(numbers, np.int64)
 
-    def _observe(self) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        once = self.task.observation_kind == Observation.GLOBAL
-        views, masks = self._simulation.observe(1 if once else self.task.n_agents)
-        return views[0] if once else views, {"action_mask": masks}
+    def _seen(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what the meta-agent sees of the agents' views, shape (V, ...)."""
+        return views[0] if self._once else views
 
     def render(self) -> Any:
         """Show the episode as ``render_mode`` says; see the PettingZoo face.

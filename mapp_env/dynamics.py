@@ -1,4 +1,4 @@
-"""The rules of version 0 (R2 to R8), written once, as kernels over one row; row loops beside them.
+"""The rules of version 0 (R2 to R8), written once, as kernels over one row.
 
 A *row* is one problem in progress, an int32 vector for N agents and K landmarks::
 
@@ -12,34 +12,39 @@ a grid into one line of int32 a cell::
 
 so that borders and walls vanish from the rules.
 
+Cells and actions are indexed as ``uint32``: a signed index costs a test for a negative one, which
+took a quarter of a batched step.
+
 With ``NUMBA_DISABLE_JIT=1`` the same source runs as plain Python.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from mapp_env.grid import Grid, fill_distances
-from mapp_env.problem import draw_landmarks
+from mapp_env.compiled import kernel
+from mapp_env.grid import Grid
 
 __all__ = [
     "ALL_PAIRS",
+    "COL",
+    "FAR",
+    "HOME",
     "N_ACTIONS",
+    "ROW",
     "WAIT",
+    "WALL",
     "Reward",
-    "action_masks",
     "cell_table",
-    "fill_fields",
-    "find_bad_action",
-    "measure_rows",
-    "reset_rows",
+    "landmark_source",
+    "measure_row",
+    "reset_row",
     "row_length",
     "step_row",
-    "step_rows",
 ]
 
 N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
@@ -50,7 +55,7 @@ ALL_PAIRS = -1
 """In place of a row's first field: ``distances`` has a line for every cell of the grid."""
 
 
-FAR = 1 << 30  # more than any distance on a grid
+FAR = np.int32(1 << 30)  # more than any distance on a grid
 
 
 class Reward(IntEnum):
@@ -70,16 +75,16 @@ def cell_table(grid: Grid) -> NDArray[np.int32]:
     """Return the grid as the kernels read it, shape (C, 9) int32."""
     cells = np.arange(grid.n_cells)
     row, col = np.divmod(cells, grid.cols)
-    columns = [grid.moves, cells, row, col, grid.home, grid.walls.ravel()]
+    columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel()]
     table = np.column_stack(columns).astype(np.int32)
     table.flags.writeable = False
     return table
 
 
-# -- the rules, for one row ------------------------------------------------------------------------
+# -- the rules -----------------------------------------------------------
 
 
-@njit(cache=True)
+@kernel
 def step_row(
     row: NDArray[np.int32],
     actions: NDArray[np.int64],
@@ -114,19 +119,29 @@ def step_row(
         The team reward (R6), terminated and truncated (R7).
     """
     step = _move(row, actions, n_agents, n_landmarks, table)
-    unvisited = _visit(row, n_agents, n_landmarks, step)
+    visited = n_agents + n_landmarks
+    distance = 0
+    unvisited = 0
+    for landmark in range(n_landmarks):
+        if row[visited + landmark] == 0:
+            if reward == Reward.GEODESIC:
+                source = landmark_source(row, n_agents, landmark, first_field)
+                steps = _nearest_by_path(row, n_agents, distances[source])
+            else:
+                steps = _nearest_by_manhattan(row, n_agents, row[n_agents + landmark], table)
+            if steps == 0:
+                _claim(row, n_agents, n_landmarks, landmark, step)
+            else:
+                unvisited += 1
+                distance += steps
     if unvisited == 0:
         return 0.0, True, False
-    if reward == Reward.MANHATTAN:
-        value = _manhattan(row, n_agents, n_landmarks, table)
-    elif reward == Reward.GEODESIC:
-        value = _geodesic(row, n_agents, n_landmarks, distances, first_field)
-    else:
-        value = 1
-    return -float(value), False, step >= max_cycles
+    if reward == Reward.STEP:
+        distance = 1
+    return -float(distance), False, step >= max_cycles
 
 
-@njit(cache=True)
+@kernel
 def _move(
     row: NDArray[np.int32],
     actions: NDArray[np.int64],
@@ -140,243 +155,105 @@ def _move(
     row[clock] += 1
     for agent in range(n_agents):
         cell = row[agent]
-        to = table[cell, actions[agent]]
+        to = table[np.uint32(cell), np.uint32(actions[agent])]
         row[agent] = to
         row[moved + agent] += to != cell
-    return row[clock]
+    return int(row[clock])
 
 
-@njit(cache=True)
-def _visit(row: NDArray[np.int32], n_agents: int, n_landmarks: int, step: int) -> int:
-    """Mark the landmarks under agents as visited (R5) and return how many are left.
+@kernel
+def _nearest_by_manhattan(
+    row: NDArray[np.int32], n_agents: int, cell: int, table: NDArray[np.int32]
+) -> int:
+    """Return the Manhattan distance from the nearest agent to a cell."""
+    to_row, to_col = table[np.uint32(cell), ROW], table[np.uint32(cell), COL]
+    least = FAR
+    for agent in range(n_agents):
+        at = np.uint32(row[agent])
+        steps = np.int32(abs(table[at, ROW] - to_row) + abs(table[at, COL] - to_col))
+        least = min(least, steps)
+    return int(least)
 
-    The agent of the lowest index on a landmark claims it.
+
+@kernel
+def _nearest_by_path(row: NDArray[np.int32], n_agents: int, field: NDArray[np.int32]) -> int:
+    """Return the least entry of ``field``, shape (C,), at the cell of an agent."""
+    least = FAR
+    for agent in range(n_agents):
+        least = min(least, field[np.uint32(row[agent])])
+    return int(least)
+
+
+@kernel
+def _claim(
+    row: NDArray[np.int32], n_agents: int, n_landmarks: int, landmark: int, step: int
+) -> None:
+    """Mark a landmark as visited for good (R5), and note what R8 needs of the agent that claims it.
+
+    That is the agent of the lowest index on it.
     """
     visited = n_agents + n_landmarks
     moved = visited + n_landmarks + 1
     claim_cell = moved + n_agents
     claim_moved = claim_cell + n_agents
     claim_step = claim_moved + n_agents
-    unvisited = 0
-    for landmark in range(n_landmarks):
-        if row[visited + landmark] == 0:
-            unvisited += 1
-            cell = row[n_agents + landmark]
-            for agent in range(n_agents):
-                if row[agent] == cell:
-                    row[visited + landmark] = 1
-                    row[claim_cell + agent] = cell
-                    row[claim_moved + agent] = row[moved + agent]
-                    row[claim_step + agent] = step
-                    unvisited -= 1
-                    break
-    return unvisited
+    cell = row[n_agents + landmark]
+    agent = 0
+    while row[agent] != cell:
+        agent += 1
+    row[visited + landmark] = 1
+    row[claim_cell + agent] = cell
+    row[claim_moved + agent] = row[moved + agent]
+    row[claim_step + agent] = step
 
 
-@njit(cache=True)
-def _manhattan(
-    row: NDArray[np.int32], n_agents: int, n_landmarks: int, table: NDArray[np.int32]
-) -> int:
-    """Return the sum over unvisited landmarks of the smallest Manhattan distance to an agent."""
-    total = 0
-    for landmark in range(n_landmarks):
-        if row[n_agents + n_landmarks + landmark] == 0:
-            cell = row[n_agents + landmark]
-            nearest = FAR
-            for agent in range(n_agents):
-                at = row[agent]
-                distance = abs(table[at, ROW] - table[cell, ROW]) + abs(
-                    table[at, COL] - table[cell, COL]
-                )
-                nearest = min(nearest, distance)
-            total += nearest
-    return total
-
-
-@njit(cache=True)
-def _geodesic(
-    row: NDArray[np.int32],
-    n_agents: int,
-    n_landmarks: int,
-    distances: NDArray[np.int32],
-    first_field: int,
-) -> int:
-    """Return the sum over unvisited landmarks of the shortest path from the nearest agent."""
-    total = 0
-    for landmark in range(n_landmarks):
-        if row[n_agents + n_landmarks + landmark] == 0:
-            source = landmark_source(row, n_agents, landmark, first_field)
-            nearest = FAR
-            for agent in range(n_agents):
-                nearest = min(nearest, distances[source, row[agent]])
-            total += nearest
-    return total
-
-
-@njit(cache=True)
-def landmark_source(
-    row: NDArray[np.int32], n_agents: int, landmark: int, first_field: int
-) -> int:
+@kernel
+def landmark_source(row: NDArray[np.int32], n_agents: int, landmark: int, first_field: int) -> int:
     """Return the line of ``distances`` with the steps from a landmark."""
     if first_field == ALL_PAIRS:
-        return row[n_agents + landmark]
+        return int(row[n_agents + landmark])
     return first_field + landmark
 
 
-# -- row loops -------------------------------------------------------------------------------------
-
-
-@njit(cache=True)
-def step_rows(
-    rows: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    skip: NDArray[np.bool_],
-    n_agents: int,
-    n_landmarks: int,
-    limits: NDArray[np.int64],
-    reward: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    rewards: NDArray[np.float64],
-    terminations: NDArray[np.bool_],
-    truncations: NDArray[np.bool_],
-) -> None:
-    """Carry out one joint action in each row but those to skip, which get reward 0 and no flag.
-
-    Shapes: ``rows`` (B, row_length), ``actions`` (B, N), all others (B,); the rest as in
-    :func:`step_row`.
-    """
-    for index in range(rows.shape[0]):
-        if skip[index]:
-            rewards[index] = 0.0
-            terminations[index] = False
-            truncations[index] = False
-            continue
-        field = first_field if first_field == ALL_PAIRS else index * n_landmarks
-        rewards[index], terminations[index], truncations[index] = step_row(
-            rows[index],
-            actions[index],
-            n_agents,
-            n_landmarks,
-            limits[index],
-            reward,
-            table,
-            distances,
-            field,
-        )
-
-
-@njit(cache=True)
-def reset_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    words: NDArray[np.uint64],
-    candidates: NDArray[np.int32],
+@kernel
+def reset_row(
+    row: NDArray[np.int32],
+    landmarks: NDArray[np.int32],
     depot: int,
     n_agents: int,
     n_landmarks: int,
 ) -> None:
-    """Start a new episode (R2) in each row of ``indices``, its landmarks drawn from its word.
-
-    Shapes: ``rows`` (B, row_length), ``indices`` and ``words`` (M,), ``candidates`` (F,).
-    """
-    for index, word in zip(indices, words):  # noqa: B905 - numba knows no strict zip
-        row = rows[index]
-        row[:] = 0
-        row[:n_agents] = depot
-        draw_landmarks(word, candidates, row[n_agents : n_agents + n_landmarks])
+    """Start an episode (R2) on landmarks that satisfy its conditions, shape (K,)."""
+    row[:] = 0
+    for agent in range(n_agents):
+        row[agent] = depot
+    for landmark in range(n_landmarks):
+        row[n_agents + landmark] = landmarks[landmark]
 
 
-@njit(cache=True)
-def fill_fields(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    table: NDArray[np.int32],
-    n_agents: int,
-    n_landmarks: int,
-    fields: NDArray[np.int32],
-    queue: NDArray[np.int32],
-) -> None:
-    """Write the steps from every landmark of some rows: how grids too large for all pairs do it.
+@kernel
+def measure_row(
+    row: NDArray[np.int32], n_agents: int, n_landmarks: int, table: NDArray[np.int32]
+) -> tuple[float, float, float]:
+    """Return cover time, makespan and total distance (R8), inf if a landmark is left.
 
-    Shapes: ``rows`` (B, row_length), ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,).
-    """
-    for index in indices:
-        for landmark in range(n_landmarks):
-            start = rows[index, n_agents + landmark]
-            fill_distances(table, start, fields[index * n_landmarks + landmark], queue)
-
-
-@njit(cache=True)
-def action_masks(
-    rows: NDArray[np.int32],
-    n_agents: int,
-    table: NDArray[np.int32],
-    masks: NDArray[np.int8],
-) -> None:
-    """Write 1 for each move that does not bump and for waiting, else 0.
-
-    Shapes: ``rows`` (B, row_length), ``masks`` (B, N, A).
-    """
-    for index in range(rows.shape[0]):
-        for agent in range(n_agents):
-            cell = rows[index, agent]
-            for action in range(masks.shape[2]):
-                masks[index, agent, action] = action == WAIT or table[cell, action] != cell
-
-
-@njit(cache=True)
-def measure_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
-    out: NDArray[np.float64],
-) -> None:
-    """Write cover time, makespan and total distance (R8) of ``indices``, or inf if unsolved.
-
-    Shapes: ``rows`` (B, row_length), ``indices`` (M,), ``out`` (M, 3). An agent's route is cut at
-    its last claim and closed by a shortest path home; without a claim it is empty.
+    An agent's route is cut at its last claim and closed by a shortest path home; without a claim
+    it is empty.
     """
     visited = n_agents + n_landmarks
     clock = visited + n_landmarks
     claim_cell = clock + 1 + n_agents
     claim_moved = claim_cell + n_agents
     claim_step = claim_moved + n_agents
-    for place, index in enumerate(indices):
-        solved = True
-        for landmark in range(n_landmarks):
-            solved = solved and rows[index, visited + landmark] == 1
-        if not solved:
-            out[place, :] = np.inf
-            continue
-        makespan = 0
-        distance = 0
-        for agent in range(n_agents):
-            step = rows[index, claim_step + agent]
-            if step > 0:
-                home = table[rows[index, claim_cell + agent], HOME]
-                makespan = max(makespan, step + home)
-                distance += rows[index, claim_moved + agent] + home
-        out[place, 0] = rows[index, clock]
-        out[place, 1] = makespan
-        out[place, 2] = distance
-
-
-@njit(cache=True)
-def find_bad_action(actions: NDArray[np.int64], n_actions: int) -> int:
-    """Return the flat position of the first action outside ``0..n_actions - 1``, or -1.
-
-    Shape: ``actions`` (M,).
-    """
-    bad = False
-    for action in actions:
-        # No early exit: the loop without one is vectorised, and bad actions are rare.
-        bad |= (action < 0) | (action >= n_actions)
-    if bad:
-        for position, action in enumerate(actions):
-            if action < 0 or action >= n_actions:
-                return position
-    return -1
+    for landmark in range(n_landmarks):
+        if row[visited + landmark] == 0:
+            return np.inf, np.inf, np.inf
+    makespan = 0
+    distance = 0
+    for agent in range(n_agents):
+        step = row[claim_step + agent]
+        if step > 0:
+            home = table[row[claim_cell + agent], HOME]
+            makespan = max(makespan, step + home)
+            distance += row[claim_moved + agent] + home
+    return float(row[clock]), float(makespan), float(distance)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from mapp_env.compiled import kernel
 from mapp_env.map_format import MAX_SIDE, ParsedMap, parse_map, read_map
 from mapp_env.validation import as_integer, describe
 
@@ -74,7 +74,7 @@ class Grid:
             raise ValueError(f"depot must be a free cell, got {describe(depot)}, which is a wall")
         object.__setattr__(self, "depot", cell)
 
-    # -- reading and writing ---------------------------------------------------------------------
+    # -- reading and writing -----------------------------------------------------------
 
     @classmethod
     def from_text(cls, text: str, depot: object = None) -> Grid:
@@ -127,7 +127,7 @@ class Grid:
         letters.flat[self.depot] = "D"
         return "\n".join("".join(row) for row in letters)
 
-    # -- shape and cells ---------------------------------------------------------------------------
+    # -- shape and cells ---------------------------------------------------------------
 
     @property
     def rows(self) -> int:
@@ -164,9 +164,9 @@ class Grid:
             return index
         if index is None and isinstance(value, tuple | list | np.ndarray) and len(value) == 2:
             row, col = as_integer(value[0]), as_integer(value[1])
-            if row is not None and col is not None:
-                if 0 <= row < self.rows and 0 <= col < self.cols:
-                    return row * self.cols + col
+            on_grid = row in range(self.rows) and col in range(self.cols)
+            if row is not None and col is not None and on_grid:
+                return row * self.cols + col
         raise ValueError(
             f"{name} must be a cell in 0..{self.n_cells - 1} or a (row, col) pair within "
             f"{self.rows} x {self.cols}, got {describe(value)}"
@@ -180,7 +180,7 @@ class Grid:
         offset = (2 * row - self.rows + 1) ** 2 + (2 * col - self.cols + 1) ** 2
         return int(free[np.argmin(offset)])
 
-    # -- tables --------------------------------------------------------------------------------------
+    # -- tables ------------------------------------------------------------------------
 
     @cached_property
     def moves(self) -> NDArray[np.int32]:
@@ -199,7 +199,7 @@ class Grid:
 
     @cached_property
     def home(self) -> NDArray[np.int32]:
-        """Steps of a shortest path from each cell to the depot, shape (C,) int32, -1 unreachable."""
+        """Steps of a shortest path from each cell to the depot, shape (C,), -1 unreachable."""
         return _frozen(self.distances_from([self.depot])[0])
 
     @cached_property
@@ -270,7 +270,7 @@ class Grid:
             path.append(cell)
         return tuple(path)
 
-    # -- identity ------------------------------------------------------------------------------------
+    # -- identity ----------------------------------------------------------------------
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Grid):
@@ -287,7 +287,7 @@ class Grid:
         )
 
 
-@njit(cache=True)
+@kernel
 def fill_distances(
     moves: NDArray[np.int32],
     start: int,

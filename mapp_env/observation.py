@@ -1,22 +1,20 @@
 """What agents see: four kinds of observation, all float32, written from rows (see ``dynamics``).
 
-=============  ============================  ========================================================
-kind           shape, per agent              what it holds
-=============  ============================  ========================================================
-``global``     (N + 2K,)                     R9, the paper's 13 numbers: all agents' cells, all
-                                             landmarks' cells, visited flags; the same for all agents
-``own_first``  (N + 2K,)                     the same with the agent's own cell first, then the others'
-``planes``     (6, rows, cols)               planes: wall; depot; the agent itself; share of the other
-                                             agents on the cell; unvisited landmarks; visited landmarks
-``geodesic``   (8K,)                         for each landmark: 1 if unvisited; own shortest path to
-                                             it; the nearest other agent's (the upper bound if there
-                                             is none); share of the other agents that are nearer, or
-                                             as near with a lower index; and for left, right, up, down
-                                             the change of the own shortest path (-1, 0 or 1)
-=============  ============================  ========================================================
+``global``, shape (N + 2K,)
+    R9, the paper's 13 numbers: all agents' cells, all landmarks' cells, visited flags; the same
+    for all agents.
+``own_first``, shape (N + 2K,)
+    The same with the agent's own cell first, then the others'.
+``planes``, shape (6, rows, cols)
+    Walls; depot; the agent itself; the share of the other agents that is on the cell; unvisited
+    landmarks; visited landmarks.
+``geodesic``, shape (8K,)
+    For each landmark: 1 if unvisited; own shortest path to it; the nearest other agent's (the upper
+    bound if there is none); the share of the other agents that are nearer, or as near with a lower
+    index; and for left, right, up, down the change of the own shortest path (-1, 0 or 1). Paths are
+    in steps divided by ``rows + cols``, so that the kind does not depend on the grid's size.
 
-Shortest paths are in steps divided by ``rows + cols``. The paper describes only ``global``
-(section 5).
+The paper describes ``global`` alone (section 5).
 """
 
 from __future__ import annotations
@@ -25,20 +23,20 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from mapp_env.dynamics import COL, FAR, HOME, N_ACTIONS, ROW, WALL, landmark_source
+from mapp_env.compiled import kernel
+from mapp_env.dynamics import COL, FAR, HOME, N_ACTIONS, ROW, WAIT, WALL, landmark_source
 from mapp_env.grid import Grid
 
-__all__ = ["Observation", "View", "observe_rows", "view"]
+__all__ = ["Observation", "View", "observe_row", "view"]
 
 N_PLANES = 6
 N_FEATURES = 4 + N_ACTIONS
 
 
 class Observation(IntEnum):
-    """The kinds of observation; :func:`observe_rows` takes their numbers."""
+    """The kinds of observation; :func:`observe_row` takes their numbers."""
 
     GLOBAL = 0
     OWN_FIRST = 1
@@ -63,57 +61,63 @@ def view(kind: Observation, grid: Grid, n_agents: int, n_landmarks: int) -> View
         farthest = grid.n_cells / (grid.rows + grid.cols)
         low = np.array([0, 0, 0, 0, *[-1] * N_ACTIONS], np.float32)
         high = np.array([1, farthest, farthest, 1, *[1] * N_ACTIONS], np.float32)
-        return View((N_FEATURES * n_landmarks,), np.tile(low, n_landmarks), np.tile(high, n_landmarks))
+        return View(
+            (N_FEATURES * n_landmarks,), np.tile(low, n_landmarks), np.tile(high, n_landmarks)
+        )
     size = n_agents + 2 * n_landmarks
     high = np.full(size, grid.n_cells - 1, np.float32)
     high[n_agents + n_landmarks :] = 1
     return View((size,), np.zeros(size, np.float32), high)
 
 
-@njit(cache=True)
-def observe_rows(
-    rows: NDArray[np.int32],
-    kind: int,
+@kernel
+def observe_row(
+    row: NDArray[np.int32],
     n_agents: int,
     n_landmarks: int,
+    kind: int,
     table: NDArray[np.int32],
     distances: NDArray[np.int32],
     first_field: int,
-    out: NDArray[np.float32],
+    views: NDArray[np.float32],
+    masks: NDArray[np.int8],
 ) -> None:
-    """Write the observations of all agents in all rows.
+    """Write the observations and action masks of all agents.
 
     Parameters
     ----------
-    rows : ndarray of int32, shape (B, row_length)
-        The rows.
-    kind : int
-        An :class:`Observation`.
-    n_agents, n_landmarks : int
-        Sizes of the problem.
+    row : ndarray of int32, shape (row_length,)
+        What is looked at.
+    n_agents, n_landmarks, kind : int
+        Sizes of the problem and an :class:`Observation`.
     table, distances, first_field
-        As in :func:`mapp_env.dynamics.step_rows`; distances are read for ``GEODESIC`` only.
-    out : ndarray of float32, shape (B, V, F)
+        As in :func:`mapp_env.dynamics.step_row`; distances are read for ``GEODESIC`` only.
+    views : ndarray of float32, shape (V, F)
         Observations, flat. V is N, or 1 to write ``GLOBAL`` once and not for each agent.
+    masks : ndarray of int8, shape (N, A)
+        Action masks: 0 for a move that would bump, 1 for any other and for waiting.
     """
-    for index in range(rows.shape[0]):
-        row = rows[index]
-        for agent in range(out.shape[1]):
-            if kind == Observation.GLOBAL:
-                for place in range(n_agents + 2 * n_landmarks):
-                    out[index, agent, place] = row[place]
-            elif kind == Observation.OWN_FIRST:
-                _write_own_first(row, agent, n_agents, n_landmarks, out[index, agent])
-            elif kind == Observation.PLANES:
-                _write_planes(row, agent, n_agents, n_landmarks, table, out[index, agent])
-            else:
-                field = first_field if first_field < 0 else index * n_landmarks
-                _write_geodesic(
-                    row, agent, n_agents, n_landmarks, table, distances, field, out[index, agent]
-                )
+    for agent in range(n_agents):
+        cell = row[agent]
+        for action in range(N_ACTIONS):
+            masks[agent, action] = table[np.uint32(cell), action] != cell
+        if masks.shape[1] > WAIT:
+            masks[agent, WAIT] = 1
+    for agent in range(views.shape[0]):
+        if kind == Observation.GLOBAL:
+            for place in range(n_agents + 2 * n_landmarks):
+                views[agent, place] = row[place]
+        elif kind == Observation.OWN_FIRST:
+            _write_own_first(row, agent, n_agents, n_landmarks, views[agent])
+        elif kind == Observation.PLANES:
+            _write_planes(row, agent, n_agents, n_landmarks, table, views[agent])
+        else:
+            _write_geodesic(
+                row, agent, n_agents, n_landmarks, table, distances, first_field, views[agent]
+            )
 
 
-@njit(cache=True)
+@kernel
 def _write_own_first(
     row: NDArray[np.int32],
     agent: int,
@@ -128,7 +132,7 @@ def _write_own_first(
         out[place] = row[place]
 
 
-@njit(cache=True)
+@kernel
 def _write_planes(
     row: NDArray[np.int32],
     agent: int,
@@ -155,7 +159,7 @@ def _write_planes(
         out[plane + row[n_agents + landmark]] = 1
 
 
-@njit(cache=True)
+@kernel
 def _write_geodesic(
     row: NDArray[np.int32],
     agent: int,

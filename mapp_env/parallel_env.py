@@ -18,7 +18,7 @@ from mapp_env.grid import Grid
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
 from mapp_env.simulation import Simulation
-from mapp_env.task import RENDER_MODES, Task
+from mapp_env.task import RENDER_MODES, Task, find_grid
 from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
 
 __all__ = ["MappParallelEnv"]
@@ -80,7 +80,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         render_mode: str | None = None,
     ) -> None:
         task = Task(
-            grid,  # type: ignore[arg-type] - a name or a path becomes a grid
+            find_grid(grid),
             n_agents,
             n_landmarks,
             max_cycles,
@@ -102,19 +102,19 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         self._names = tuple(self.possible_agents)
         self._n_actions = task.n_actions
         self._actions = np.zeros(task.n_agents, np.int64)
-        self._simulation = Simulation(task)
+        self._simulation = Simulation(task, task.n_agents)
         self._np_random: np.random.Generator | None = None
         self._display = Display(task.render_mode, self.metadata["render_fps"])
 
-    # -- what agents have ----------------------------------------------------------------------------
+    # -- what agents have --------------------------------------------------------------
 
     def observation_space(self, agent: AgentID) -> Box:
         """Return the space of an agent's observations; the same object each time."""
-        return self.observation_spaces[agent]  # type: ignore[return-value]
+        return self.observation_spaces[agent]
 
     def action_space(self, agent: AgentID) -> Discrete[np.int64]:
         """Return the space of an agent's actions; the same object each time."""
-        return self.action_spaces[agent]  # type: ignore[return-value]
+        return self.action_spaces[agent]
 
     @property
     def max_cycles(self) -> int:
@@ -129,7 +129,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         """Return the global observation (R9), shape (N + 2K,) float32, whatever agents see."""
         return self._simulation.state()
 
-    # -- episodes ------------------------------------------------------------------------------------
+    # -- episodes ----------------------------------------------------------------------
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -163,7 +163,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
             self._np_random, _ = seeding.np_random(seed)
         self._simulation.reset(problem, self._np_random)
         self.agents = list(self._names)
-        observations, infos = self._observe()
+        observations, infos = self._by_agent(*self._simulation.observe())
         if self.render_mode == "human":
             self.render()
         return observations, infos
@@ -204,9 +204,9 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
                 return {}, {}, {}, {}, {}
             raise ResetNeeded("step() needs an episode in progress: call reset() first")
         self._read_actions(actions)
-        reward, terminated, truncated = simulation.step(self._actions)
+        reward, terminated, truncated, views, masks = simulation.step(self._actions)
+        observations, infos = self._by_agent(views, masks)
         names = self._names
-        observations, infos = self._observe()
         if terminated or truncated:
             self.agents = []
             for info in infos.values():
@@ -221,13 +221,16 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
             infos,
         )
 
-    def _observe(self) -> tuple[dict[AgentID, NDArray[np.float32]], Infos]:
-        names = self._names
-        views, masks = self._simulation.observe(len(names))
-        return (
-            dict(zip(names, views, strict=True)),
-            {name: {"action_mask": mask} for name, mask in zip(names, masks, strict=True)},
-        )
+    def _by_agent(
+        self, views: NDArray[np.float32], masks: NDArray[np.int8]
+    ) -> tuple[dict[AgentID, NDArray[np.float32]], Infos]:
+        observations: dict[AgentID, NDArray[np.float32]] = {}
+        infos: Infos = {}
+        # By index: to iterate over an array takes three times as long, a tenth of a step.
+        for index, name in enumerate(self._names):
+            observations[name] = views[index]
+            infos[name] = {"action_mask": masks[index]}
+        return observations, infos
 
     def _read_actions(self, actions: Mapping[AgentID, int]) -> None:
         """Copy the agents' actions into the array that the kernel reads."""
@@ -256,7 +259,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
             f"missing: {describe(missing)}, unknown: {describe(unknown)}"
         )
 
-    # -- pictures ------------------------------------------------------------------------------------
+    # -- pictures ----------------------------------------------------------------------
 
     def render(self) -> NDArray[np.uint8] | str | None:
         """Show the episode as ``render_mode`` says.

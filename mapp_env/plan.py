@@ -14,7 +14,8 @@ from mapp_env.dynamics import (
     WAIT,
     Reward,
     cell_table,
-    measure_rows,
+    measure_row,
+    reset_row,
     row_length,
     step_row,
 )
@@ -92,8 +93,8 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
     grid = problem.grid
     table = cell_table(grid)
     row = np.zeros(row_length(n_agents, n_landmarks), np.int32)
-    row[:n_agents] = grid.depot
-    row[n_agents : n_agents + n_landmarks] = problem.landmarks
+    landmarks = np.array(problem.landmarks, np.int32)
+    reset_row(row, landmarks, grid.depot, n_agents, n_landmarks)
     flags = row[n_agents + n_landmarks : n_agents + 2 * n_landmarks]
     limit = len(actions) if problem.max_cycles is None else problem.max_cycles
     distances = np.zeros((1, 1), np.int32)
@@ -124,10 +125,9 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
             tours[agent] = (*routes[agent], *grid.path(cell, grid.depot)[1:])
         if terminated:
             break
-    costs = np.empty((1, 3))
-    measure_rows(row[None], np.zeros(1, np.int64), n_agents, n_landmarks, table, costs)
-    whole = bool(np.isfinite(costs).all())
-    cover_time, makespan, total = ((int(cost) if whole else math.inf) for cost in costs[0])
+    costs = measure_row(row, n_agents, n_landmarks, table)
+    whole = bool(flags.all())
+    cover_time, makespan, total = (int(cost) if whole else math.inf for cost in costs)
     return Plan(
         tours=tuple(tours),
         claims=tuple(tuple(cells) for cells in claims),

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from mapp_env.compiled import kernel
 from mapp_env.grid import Grid
 from mapp_env.validation import check_count, describe
 
@@ -189,10 +189,8 @@ def sample_problems(
     return problems
 
 
-@njit(cache=True)
-def draw_landmarks(
-    word: np.uint64, candidates: NDArray[np.int32], out: NDArray[np.int32]
-) -> None:
+@kernel
+def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[np.int32]) -> None:
     """Choose distinct cells, every set equally likely, as a function of one random word.
 
     Floyd's sampling (Bentley and Floyd 1987, doi:10.1145/30401.315746), then sorted: landmarks are
@@ -237,7 +235,7 @@ def draw_landmarks(
         out[index] = candidates[out[index]]
 
 
-@njit(cache=True)
+@kernel
 def _scramble(state: int) -> int:
     """Return a 32-bit permutation of ``state`` (PCG RXS-M-XS; O'Neill 2014, HMC-CS-2014-0905).
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.dynamics import ALL_PAIRS, N_ACTIONS, Reward, cell_table, row_length
+from mapp_env.dynamics import N_ACTIONS, Reward, cell_table
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.grids import grid_names, make_grid
 from mapp_env.observation import Observation, View, view
@@ -25,7 +25,7 @@ from mapp_env.problem import (
 )
 from mapp_env.validation import check_choice, check_count, check_flag, describe
 
-__all__ = ["RENDER_MODES", "Task"]
+__all__ = ["RENDER_MODES", "Task", "find_grid"]
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
 
@@ -39,8 +39,8 @@ class Task:
 
     Parameters
     ----------
-    grid : str, os.PathLike or Grid
-        A bundled name, a path to a text or ``.map`` file, or a grid.
+    grid : Grid
+        The grid; :func:`find_grid` finds one by name or path.
     n_agents : int
         1 to 16.
     n_landmarks : int
@@ -80,8 +80,8 @@ class Task:
             "observation": check_choice("observation", self.observation, _names(Observation)),
             "allow_wait": check_flag("allow_wait", self.allow_wait),
             "render_mode": check_choice("render_mode", self.render_mode, (None, *RENDER_MODES)),
-            "grid": _find_grid(self.grid),
         }
+        check_grid("grid", self.grid)
         for name, value in values.items():
             object.__setattr__(self, name, value)
         room = self.grid.reachable.size
@@ -92,17 +92,12 @@ class Task:
             )
         self.check_memory(1)
 
-    # -- what follows from the arguments -------------------------------------------------------------
+    # -- what follows from the arguments -----------------------------------------------
 
     @property
     def n_actions(self) -> int:
         """Number of actions an agent has: 4, or 5 with waiting."""
         return N_ACTIONS + self.allow_wait
-
-    @property
-    def row_length(self) -> int:
-        """Number of int32 in a row of state."""
-        return row_length(self.n_agents, self.n_landmarks)
 
     @property
     def state_length(self) -> int:
@@ -150,16 +145,11 @@ class Task:
 
     @property
     def needs_fields(self) -> bool:
-        """Whether shortest paths are kept for each landmark because the grid is too large for all."""
+        """Whether paths are kept for each landmark, the grid being too large for all pairs."""
         return self.needs_distances and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
 
-    @property
-    def first_field(self) -> int:
-        """What the kernels take for the first line of ``distances`` of the first row."""
-        return 0 if self.needs_fields else ALL_PAIRS
-
     def new_distances(self, n_rows: int) -> NDArray[np.int32]:
-        """Return the distances that kernels read: all pairs (shared) or room for a field a landmark.
+        """Return the distances that kernels read: all pairs (shared) or a field a landmark.
 
         Shape (C, C), (n_rows * K, C), or (1, 1) if nothing looks up shortest paths.
         """
@@ -191,7 +181,7 @@ class Task:
                 f"on {self.grid!r} would take {size} bytes, allowed are {MAX_BYTES}"
             )
 
-    # -- what a reset may ask for --------------------------------------------------------------------
+    # -- what a reset may ask for ------------------------------------------------------
 
     def check_options(self, options: Mapping[str, Any] | None) -> Problem | None:
         """Return the problem that ``reset(options=...)`` asks for, or ``None`` for a random one.
@@ -212,9 +202,7 @@ class Task:
         if problem is None and landmarks is None:
             return None
         if problem is None:
-            cells = check_landmarks(
-                self.grid, landmarks, self.n_landmarks, "options['landmarks']"
-            )
+            cells = check_landmarks(self.grid, landmarks, self.n_landmarks, "options['landmarks']")
             return Problem(self.grid, cells, self.n_agents)
         if landmarks is not None:
             raise ValueError("options must hold 'problem' or 'landmarks', got both")
@@ -236,14 +224,20 @@ def _names(kinds: type[Reward] | type[Observation]) -> tuple[str, ...]:
     return tuple(kind.name.lower() for kind in kinds)
 
 
-def _find_grid(grid: object) -> Grid:
-    """Return the grid meant by a grid, a bundled name or a path."""
+def find_grid(grid: object) -> Grid:
+    """Return the grid meant by a grid, a bundled name or a path to a map file.
+
+    Raises
+    ------
+    ValueError
+        If ``grid`` is none of them, or the file cannot be used.
+    """
     if isinstance(grid, Grid):
-        return check_grid("grid", grid)
+        return grid
     if isinstance(grid, str) and grid in grid_names():
         return make_grid(grid)
     if isinstance(grid, os.PathLike) or (isinstance(grid, str) and os.path.lexists(grid)):
-        return check_grid("grid", Grid.load(grid))
+        return Grid.load(grid)
     raise ValueError(
         f"grid must be a mapp_env.Grid, a bundled name ({', '.join(grid_names())}) or a path to a "
         f"map file; got {describe(grid)}"

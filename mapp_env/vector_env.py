@@ -10,36 +10,25 @@ import numpy as np
 from gymnasium import logger
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mapp_env.central_env import CentralEnv, central_action_space
-from mapp_env.dynamics import (
-    action_masks,
-    fill_fields,
-    find_bad_action,
-    measure_rows,
-    reset_rows,
-    step_rows,
-)
 from mapp_env.grid import Grid
-from mapp_env.observation import Observation, observe_rows
+from mapp_env.observation import Observation
 from mapp_env.problem import check_landmarks
 from mapp_env.rendering.display import Display
-from mapp_env.simulation import scene_of
-from mapp_env.task import Task
-from mapp_env.validation import MAX_SEED, as_integer, check_choice, check_count, describe
+from mapp_env.row_seeds import RowSeeds
+from mapp_env.rows import Rows, find_bad_action
+from mapp_env.task import Task, find_grid
+from mapp_env.validation import check_choice, check_count, describe
 
 __all__ = ["MAX_ENVS", "MappVectorEnv", "make_vec"]
 
 MAX_ENVS = 1 << 20
 
 VECTOR_RENDER_MODES = ("rgb_array", "ansi")
-
-WORDS_AHEAD = 16
-"""Random words fetched from a row's generator at a time: a call for each would dominate a step."""
 
 
 class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
@@ -82,7 +71,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     ) -> None:
         self.num_envs = check_count("num_envs", num_envs, 1, MAX_ENVS)
         task = Task(
-            grid,  # type: ignore[arg-type] - a name or a path becomes a grid
+            find_grid(grid),
             n_agents,
             n_landmarks,
             max_cycles,
@@ -107,64 +96,29 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self.single_action_space, self._joint_actions = central_action_space(task, central_action)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-        self._sizes = (task.n_agents, task.n_landmarks)
-        self._n_views = 1 if task.observation_kind == Observation.GLOBAL else task.n_agents
-        self._rows = np.zeros((self.num_envs, task.row_length), np.int32)
-        self._distances = task.new_distances(self.num_envs)
-        self._queue = np.empty(task.grid.n_cells if task.needs_fields else 0, np.int32)
+        n_views = 1 if task.observation_kind == Observation.GLOBAL else task.n_agents
+        self._rows = Rows(task, self.num_envs, n_views)
+        self._observations_shape = self.observation_space.shape
+        self._seeds = RowSeeds(self.num_envs)
         self._started = False
         self._ended = np.zeros(self.num_envs, np.bool_)  # finished, not yet reset
         self._nobody = np.zeros(self.num_envs, np.bool_)
-        self._generators: list[np.random.Generator] = []
-        self._seeds: list[int] = []
-        self._words = np.zeros((self.num_envs, WORDS_AHEAD), np.uint64)
-        self._words_used = np.full(self.num_envs, WORDS_AHEAD, np.int64)
-        self._limits = np.full(self.num_envs, task.max_cycles, np.int64)
-        self._trails: list[list[tuple[int, ...]]] = [[] for _ in range(self.num_envs)]
 
-    # -- seeds ---------------------------------------------------------------------------------------
+    # -- seeds -------------------------------------------------------------------------
 
-    @property
+    @property  # type: ignore[misc]
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The seed of each row; a single environment reset with it is that row."""
-        self._seed_rows(None, [])
-        return tuple(self._seeds)
+        self._seeds.seed(None, [])
+        return tuple(self._seeds.seeds)
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """The generator of each row; up to 16 words of it may have been fetched ahead."""
-        self._seed_rows(None, [])
-        return tuple(self._generators)
+        """The generator of each row; up to 64 words of it may have been fetched ahead."""
+        self._seeds.seed(None, [])
+        return tuple(self._seeds.generators)
 
-    def _seed_rows(self, seed: int | list[int | None] | None, indices: list[int]) -> None:
-        """Give rows new generators: those of ``indices`` as ``seed`` says, all if none has one yet."""
-        if not self._generators:
-            self._generators = [np.random.default_rng(0)] * self.num_envs
-            self._seeds = [0] * self.num_envs
-            spread = seed if isinstance(seed, int) else None
-            self._set_seeds(_spread_seed(spread, self.num_envs), list(range(self.num_envs)))
-        elif isinstance(seed, int):
-            self._set_seeds(_spread_seed(seed, self.num_envs), indices)
-        if isinstance(seed, list):
-            self._set_seeds(seed, [index for index in indices if seed[index] is not None])
-
-    def _set_seeds(self, seeds: Sequence[int | None], indices: list[int]) -> None:
-        for index in indices:
-            self._generators[index], self._seeds[index] = seeding.np_random(seeds[index])
-        self._words_used[indices] = WORDS_AHEAD
-
-    def _next_words(self, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
-        """Return the next random word of each row of ``indices``, shape (M,)."""
-        used = self._words_used
-        for index in indices[used[indices] == WORDS_AHEAD]:
-            generator = self._generators[index]
-            self._words[index] = generator.integers(2**64, size=WORDS_AHEAD, dtype=np.uint64)
-            used[index] = 0
-        words: NDArray[np.uint64] = self._words[indices, used[indices]]
-        used[indices] += 1
-        return words
-
-    # -- episodes ------------------------------------------------------------------------------------
+    # -- episodes ----------------------------------------------------------------------
 
     def reset(
         self,
@@ -177,9 +131,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         Parameters
         ----------
         seed : int or sequence of B ints (or None), optional
-            An int is spread over the rows by ``numpy.random.SeedSequence`` (row ``i`` gets the same
-            seed whatever the number of rows, and seeds 0 and 1 have no row in common); a sequence
-            seeds each row.
+            An int is spread over the rows, see :meth:`mapp_env.row_seeds.RowSeeds.seed`; a sequence
+            seeds each row, but those of ``None``.
         options : dict, optional
             ``"reset_mask"``: bool, shape (B,). ``"landmarks"`` or ``"problem"``: as in the single
             environment, for all rows alike; or the landmarks of each row as an int array of cells,
@@ -197,44 +150,21 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         ValueError
             If seed or options cannot be used; nothing has been reset then.
         """
-        seeds = self._check_seed(seed)
+        seeds = self._seeds.check(seed)
         mask = self._check_reset_mask(options)
         landmarks, limit = self._check_problems(options)
         indices = np.flatnonzero(mask)
-        self._seed_rows(seeds, indices.tolist())
-        self._start(indices, landmarks, limit)
-        self._started = True
-        observations, action_mask = self._observe(self._rows)
-        action_mask[~mask] = 0
-        return observations, {"action_mask": action_mask, "_action_mask": mask}
-
-    def _start(
-        self,
-        indices: NDArray[np.int64],
-        landmarks: NDArray[np.int32] | None = None,
-        limit: int | None = None,
-    ) -> None:
-        """Start an episode in the rows of ``indices``, on given or else on random landmarks."""
-        task = self.task
+        self._seeds.seed(seeds, indices.tolist())
         if landmarks is None:
-            words = self._next_words(indices)
+            self._rows.start(indices, self._seeds.next_words(indices))
         else:
-            words = np.zeros(len(indices), np.uint64)
-        reset_rows(
-            self._rows, indices, words, task.grid.reachable, task.grid.depot, *self._sizes
-        )
-        if landmarks is not None:
-            self._rows[indices, task.n_agents : task.n_agents + task.n_landmarks] = landmarks[indices]
-        if task.needs_fields:
-            fill_fields(
-                self._rows, indices, task.table, *self._sizes, self._distances, self._queue
-            )
-        self._limits[indices] = task.max_cycles if limit is None else limit
+            self._rows.start(indices, None, landmarks[indices], limit)
         self._ended[indices] = False
-        if self.render_mode is not None:
-            for index in indices:
-                self._trails[index] = []
-            self._extend_trails(indices)
+        self._started = True
+        views, action_mask = self._rows.observe()
+        action_mask[~mask] = 0
+        infos = {"action_mask": action_mask, "_action_mask": mask}
+        return views.reshape(self._observations_shape), infos
 
     def step(
         self, actions: NDArray[np.integer[Any]]
@@ -275,82 +205,51 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 "reset(options={'reset_mask': mask})"
             )
         joint_actions = self._read_actions(actions)
-        waiting = self._ended if mode == AutoresetMode.NEXT_STEP else self._nobody
-        rewards = np.empty(self.num_envs)
-        terminations = np.empty(self.num_envs, np.bool_)
-        truncations = np.empty(self.num_envs, np.bool_)
-        task = self.task
-        step_rows(
-            self._rows,
-            joint_actions,
-            waiting,
-            *self._sizes,
-            self._limits,
-            int(task.reward_kind),
-            task.table,
-            self._distances,
-            task.first_field,
-            rewards,
-            terminations,
-            truncations,
-        )
-        if self.render_mode is not None:
-            self._extend_trails(np.flatnonzero(~waiting))
+        skip = self._nobody
         if mode == AutoresetMode.NEXT_STEP:
-            self._start(np.flatnonzero(waiting))
+            skip = self._ended
+            starting = np.flatnonzero(skip)
+            self._rows.start(starting, self._seeds.next_words(starting))
+        rewards, terminations, truncations, views, masks = self._rows.step(joint_actions, skip)
+        observations = views.reshape(self._observations_shape)
         self._ended = terminations | truncations
         ended = np.flatnonzero(self._ended)
         infos: dict[str, Any] = {}
         if len(ended) and mode == AutoresetMode.SAME_STEP:
-            self._add_finals(infos, ended)
-            self._start(ended)
+            self._add_finals(infos, ended, observations[ended], masks[ended])
+            self._rows.start(ended, self._seeds.next_words(ended))
+            views[ended], masks[ended] = self._rows.observe(ended)
         elif len(ended):
             self._add_metrics(infos, ended)
-        observations, infos["action_mask"] = self._observe(self._rows)
+        infos["action_mask"] = masks
         infos["_action_mask"] = np.ones(self.num_envs, np.bool_)
         return observations, rewards, terminations, truncations, infos
 
-    def _observe(
-        self, rows: NDArray[np.int32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-        """Return fresh observations and action masks, shapes (B, ...) and (B, N, A)."""
-        task = self.task
-        n_rows = len(rows)
-        out = np.empty((n_rows, self._n_views, task.view.low.size), np.float32)
-        masks = np.empty((n_rows, task.n_agents, task.n_actions), np.int8)
-        kind = int(task.observation_kind)
-        observe_rows(rows, kind, *self._sizes, task.table, self._distances, task.first_field, out)
-        action_masks(rows, task.n_agents, task.table, masks)
-        return out.reshape(n_rows, *task.central_view.shape), masks
-
-    # -- infos of rows that ended -----------------------------------------------------------------------
+    # -- infos of rows that ended ------------------------------------------------------
 
     def _add_metrics(self, infos: dict[str, Any], ended: NDArray[np.int64]) -> None:
         """Add the metrics of the rows of ``ended``, in the manner of ``VectorEnv._add_info``."""
-        costs = np.empty((len(ended), 3))
-        measure_rows(self._rows, ended, *self._sizes, self.task.table, costs)
-        columns = {
-            "success": np.isfinite(costs[:, 0]),
-            "cover_time": costs[:, 0],
-            "makespan": costs[:, 1],
-            "total_distance": costs[:, 2],
-        }
-        metrics: dict[str, Any] = {}
-        for name, values in columns.items():
-            metrics[name] = np.zeros(self.num_envs, values.dtype)
-            metrics[name][ended] = values
-            metrics[f"_{name}"] = self._flags(ended)
-        infos["metrics"] = metrics
-        infos["_metrics"] = self._flags(ended)
+        costs = self._rows.measure(ended)
+        columns = np.zeros((3, self.num_envs))
+        columns[:, ended] = costs.T
+        flags = self._flags(ended)
+        success = np.zeros(self.num_envs, np.bool_)
+        success[ended] = np.isfinite(costs[:, 0])
+        metrics: dict[str, NDArray[Any]] = {"success": success, "_success": flags}
+        for name, column in zip(("cover_time", "makespan", "total_distance"), columns, strict=True):
+            metrics[name], metrics[f"_{name}"] = column, flags.copy()
+        infos["metrics"], infos["_metrics"] = metrics, flags.copy()
 
-    def _add_finals(self, infos: dict[str, Any], ended: NDArray[np.int64]) -> None:
-        """Add the last observation and info of the rows of ``ended``."""
-        if self.task.needs_fields:  # fields are found by a row's place in the whole batch
-            observations, masks = (array[ended] for array in self._observe(self._rows))
-        else:
-            observations, masks = self._observe(self._rows[ended])
+    def _add_finals(
+        self,
+        infos: dict[str, Any],
+        ended: NDArray[np.int64],
+        observations: NDArray[np.float32],
+        masks: NDArray[np.int8],
+    ) -> None:
+        """Add the last observations and infos of the rows of ``ended``."""
         final_obs = np.full(self.num_envs, None, dtype=object)
-        for index, observation in zip(ended, observations, strict=True):
+        for index, observation in zip(ended.tolist(), observations, strict=True):
             final_obs[index] = observation
         action_mask = np.zeros((self.num_envs, *masks.shape[1:]), np.int8)
         action_mask[ended] = masks
@@ -364,7 +263,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         flags[indices] = True
         return flags
 
-    # -- checks ----------------------------------------------------------------------------------------
+    # -- checks ------------------------------------------------------------------------
 
     def _read_actions(self, actions: Any) -> NDArray[np.int64]:
         """Return each agent's action in each row, shape (B, N)."""
@@ -382,23 +281,10 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if bad >= 0:
             place = ", ".join(str(int(index)) for index in np.unravel_index(bad, shape))
             raise ValueError(
-                f"actions[{place}] must be in 0..{n_actions - 1}, got {np.asarray(actions).flat[bad]}"
+                f"actions[{place}] must be in 0..{n_actions - 1}, "
+                f"got {np.asarray(actions).flat[bad]}"
             )
         return array if self._joint_actions is None else self._joint_actions[array]
-
-    def _check_seed(self, seed: object) -> int | list[int | None] | None:
-        if seed is None:
-            return None
-        if as_integer(seed) is not None:
-            return check_count("seed", seed, 0, MAX_SEED)
-        if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
-            raise ValueError(f"seed must be an integer, one for each row or None, got {describe(seed)}")
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must hold {self.num_envs} seeds, one a row, got {len(seed)}")
-        return [
-            None if one is None else check_count(f"seed[{index}]", one, 0, MAX_SEED)
-            for index, one in enumerate(seed)
-        ]
 
     def _check_reset_mask(self, options: Mapping[str, Any] | None) -> NDArray[np.bool_]:
         """Return which rows to reset, shape (B,), the caller's array untouched."""
@@ -413,7 +299,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"options['reset_mask'] must be a bool array of shape ({self.num_envs},) with at "
                 f"least one True, got {describe(mask)}"
             )
-        return mask.copy()
+        return np.array(mask, np.bool_)
 
     def _check_problems(
         self, options: Mapping[str, Any] | None
@@ -445,11 +331,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 check_landmarks(grid, cells, name=f"options['landmarks'][{index}]")
         return landmarks.astype(np.int32)
 
-    # -- pictures ----------------------------------------------------------------------------------------
-
-    def _extend_trails(self, indices: NDArray[np.int64]) -> None:
-        for index in indices:
-            self._trails[index].append(tuple(self._rows[index, : self.task.n_agents].tolist()))
+    # -- pictures ----------------------------------------------------------------------
 
     def render(self) -> tuple[Any, ...] | None:
         """Return a picture of each row: arrays for "rgb_array", strings for "ansi".
@@ -465,12 +347,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             logger.warn("render() shows nothing: make the environment with a render_mode")
             return None
         display = Display(self.render_mode, self.metadata["render_fps"])
-        return tuple(
-            display.show(
-                scene_of(self.task, row, self._trails[index], int(self._limits[index]))
-            )
-            for index, row in enumerate(self._rows)
-        )
+        return tuple(display.show(self._rows.scene(index)) for index in range(self.num_envs))
 
 
 def make_vec(num_envs: int, **arguments: Any) -> MappVectorEnv:
@@ -504,12 +381,6 @@ def make_vec(num_envs: int, **arguments: Any) -> MappVectorEnv:
 def make_gymnasium_vec(num_envs: int, **arguments: Any) -> MappVectorEnv:
     """Return what ``gymnasium.make_vec("mapp_env/Central-v0")`` means: the single one's actions."""
     return MappVectorEnv(num_envs, **{"central_action": "auto", **arguments})
-
-
-def _spread_seed(seed: int | None, count: int) -> list[int]:
-    """Return ``count`` independent seeds that depend on ``seed`` and their place alone."""
-    words: list[int] = np.random.SeedSequence(seed).generate_state(count, np.uint64).tolist()
-    return words
 
 
 def _find_mode(mode: object) -> AutoresetMode:

@@ -1,0 +1,42 @@
+"""The scene: everything that a picture needs to know, and nothing of how it came about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mapp_env.grid import Grid
+
+__all__ = ["Scene"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a picture shows of one moment of one episode.
+
+    Parameters
+    ----------
+    grid : Grid
+        The walls and the depot.
+    landmarks : tuple of int, length K
+        The landmarks' cells.
+    visited : tuple of bool, length K
+        Whether each landmark has been visited.
+    cells : tuple of int, length N
+        Where each agent is.
+    trails : tuple of tuple of int, length N
+        The cells that each agent was on, oldest first and the present one last.
+    step : int
+        Steps since the reset.
+    max_cycles : int
+        The step at which the episode is truncated.
+    """
+
+    grid: Grid
+    landmarks: tuple[int, ...]
+    visited: tuple[bool, ...]
+    cells: tuple[int, ...]
+    trails: tuple[tuple[int, ...], ...]
+    step: int
+    max_cycles: int
