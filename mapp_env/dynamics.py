@@ -20,6 +20,7 @@ With ``NUMBA_DISABLE_JIT=1`` the same source runs as plain Python.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
@@ -31,9 +32,11 @@ from mapp_env.grid import Grid
 
 __all__ = [
     "ALL_PAIRS",
+    "BY_COORDINATES",
     "COL",
     "FAR",
     "HOME",
+    "MAX_TABLE_CELLS",
     "N_ACTIONS",
     "ROW",
     "WAIT",
@@ -41,6 +44,7 @@ __all__ = [
     "Reward",
     "cell_table",
     "landmark_source",
+    "manhattan_table",
     "measure_row",
     "reset_row",
     "row_length",
@@ -51,9 +55,13 @@ N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
 WAIT = 4
 ROW, COL, HOME, WALL = 5, 6, 7, 8  # columns of a table, after the five moves
 
-ALL_PAIRS = -1
-"""In place of a row's first field: ``distances`` has a line for every cell of the grid."""
+# Where the distances of a row's landmarks stand: from this line of `distances` on, or
+ALL_PAIRS = -1  # in `distances`, in the line of each landmark's cell
+BY_COORDINATES = -2  # nowhere: Manhattan distances are computed from rows and columns
 
+MAX_TABLE_CELLS = (
+    256  # largest grid for a table of Manhattan distances: it should stay in the cache
+)
 
 FAR = np.int32(1 << 30)  # more than any distance on a grid
 
@@ -77,6 +85,14 @@ def cell_table(grid: Grid) -> NDArray[np.int32]:
     row, col = np.divmod(cells, grid.cols)
     columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel()]
     table = np.column_stack(columns).astype(np.int32)
+    table.flags.writeable = False
+    return table
+
+
+def manhattan_table(grid: Grid) -> NDArray[np.int32]:
+    """Return the Manhattan distances between all pairs of cells, shape (C, C) int32."""
+    row, col = np.divmod(np.arange(grid.n_cells, dtype=np.int32), grid.cols)
+    table = abs(row[:, None] - row) + abs(col[:, None] - col)
     table.flags.writeable = False
     return table
 
@@ -109,9 +125,10 @@ def step_row(
     table : ndarray of int32, shape (C, 9)
         From :func:`cell_table`.
     distances : ndarray of int32, shape (S, C)
-        Steps from sources to cells; read for geodesic rewards only.
+        Distances from sources to cells: Manhattan, or shortest paths for the geodesic reward.
     first_field : int
-        Line of ``distances`` that belongs to the first landmark, or ``ALL_PAIRS``.
+        Line of ``distances`` that belongs to the first landmark, ``ALL_PAIRS`` or, for Manhattan
+        distances, ``BY_COORDINATES``.
 
     Returns
     -------
@@ -119,21 +136,14 @@ def step_row(
         The team reward (R6), terminated and truncated (R7).
     """
     step = _move(row, actions, n_agents, n_landmarks, table)
-    visited = n_agents + n_landmarks
-    distance = 0
-    unvisited = 0
-    for landmark in range(n_landmarks):
-        if row[visited + landmark] == 0:
-            if reward == Reward.GEODESIC:
-                source = landmark_source(row, n_agents, landmark, first_field)
-                steps = _nearest_by_path(row, n_agents, distances[source])
-            else:
-                steps = _nearest_by_manhattan(row, n_agents, row[n_agents + landmark], table)
-            if steps == 0:
-                _claim(row, n_agents, n_landmarks, landmark, step)
-            else:
-                unvisited += 1
-                distance += steps
+    if first_field == BY_COORDINATES:
+        unvisited, distance = _visit(
+            row, n_agents, n_landmarks, step, _nearest_by_coordinates, table, first_field
+        )
+    else:
+        unvisited, distance = _visit(
+            row, n_agents, n_landmarks, step, _nearest_by_table, distances, first_field
+        )
     if unvisited == 0:
         return 0.0, True, False
     if reward == Reward.STEP:
@@ -162,26 +172,71 @@ def _move(
 
 
 @kernel
-def _nearest_by_manhattan(
-    row: NDArray[np.int32], n_agents: int, cell: int, table: NDArray[np.int32]
-) -> int:
-    """Return the Manhattan distance from the nearest agent to a cell."""
-    to_row, to_col = table[np.uint32(cell), ROW], table[np.uint32(cell), COL]
-    least = FAR
-    for agent in range(n_agents):
-        at = np.uint32(row[agent])
-        steps = np.int32(abs(table[at, ROW] - to_row) + abs(table[at, COL] - to_col))
-        least = min(least, steps)
-    return int(least)
+def _visit(
+    row: NDArray[np.int32],
+    n_agents: int,
+    n_landmarks: int,
+    step: int,
+    nearest: Callable[[NDArray[np.int32], int, int, NDArray[np.int32], int], int],
+    distances: NDArray[np.int32],
+    first_field: int,
+) -> tuple[int, int]:
+    """Visit the landmarks under agents (R5).
+
+    Returns
+    -------
+    int, int
+        How many landmarks are left, and the sum of their distances from the nearest agent (R6).
+    """
+    visited = n_agents + n_landmarks
+    unvisited = 0
+    total = 0
+    for landmark in range(n_landmarks):
+        # All landmarks alike, visited or not: whether one is visited is as good as random to the
+        # processor, and a branch on it would cost more than a distance.
+        flag = row[visited + landmark]
+        distance = nearest(row, n_agents, landmark, distances, first_field)
+        if (distance == 0) & (flag == 0):
+            _claim(row, n_agents, n_landmarks, landmark, step)
+            flag = np.int32(1)
+        left = 1 - flag
+        unvisited += left
+        total += left * distance
+    return unvisited, total
 
 
 @kernel
-def _nearest_by_path(row: NDArray[np.int32], n_agents: int, field: NDArray[np.int32]) -> int:
-    """Return the least entry of ``field``, shape (C,), at the cell of an agent."""
+def _nearest_by_table(
+    row: NDArray[np.int32],
+    n_agents: int,
+    landmark: int,
+    distances: NDArray[np.int32],
+    first_field: int,
+) -> int:
+    """Return the distance from the nearest agent to a landmark, looked up."""
+    source = np.uint32(landmark_source(row, n_agents, landmark, first_field))
     least = FAR
     for agent in range(n_agents):
-        least = min(least, field[np.uint32(row[agent])])
-    return int(least)
+        least = min(least, distances[source, np.uint32(row[agent])])
+    return least  # type: ignore[return-value]
+
+
+@kernel
+def _nearest_by_coordinates(
+    row: NDArray[np.int32],
+    n_agents: int,
+    landmark: int,
+    table: NDArray[np.int32],
+    first_field: int,
+) -> int:
+    """Return the Manhattan distance from the nearest agent to a landmark, computed."""
+    cell = np.uint32(row[n_agents + landmark])
+    least = FAR
+    for agent in range(n_agents):
+        at = np.uint32(row[agent])
+        distance = abs(table[at, ROW] - table[cell, ROW]) + abs(table[at, COL] - table[cell, COL])
+        least = min(least, np.int32(distance))
+    return least  # type: ignore[return-value]
 
 
 @kernel

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.map_format import MAX_SIDE, ParsedMap, parse_map, read_map
+from mapp_env.map_format import MAX_SIDE, MapError, ParsedMap, parse_map, read_map
 from mapp_env.validation import as_integer, describe
 
 __all__ = ["MAX_ALL_PAIRS_CELLS", "Grid"]
@@ -94,7 +94,7 @@ class Grid:
         """
         if not isinstance(text, str):
             raise ValueError(f"text must be a str of map rows, got {describe(text)}")
-        return cls._from_parsed(parse_map(text), depot)
+        return cls._from_parsed(parse_map(text), depot, "text")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], depot: object = None) -> Grid:
@@ -115,11 +115,14 @@ class Grid:
         """
         if not isinstance(path, str | os.PathLike):
             raise ValueError(f"path must be a str or os.PathLike, got {describe(path)}")
-        return cls._from_parsed(read_map(path), depot)
+        return cls._from_parsed(read_map(path), depot, os.fspath(path))
 
     @classmethod
-    def _from_parsed(cls, parsed: ParsedMap, depot: object) -> Grid:
-        return cls(parsed.walls, parsed.depot if depot is None else depot)
+    def _from_parsed(cls, parsed: ParsedMap, depot: object, source: str) -> Grid:
+        try:
+            return cls(parsed.walls, parsed.depot if depot is None else depot)
+        except ValueError as error:
+            raise MapError(f"{source}: {error}") from error
 
     def to_text(self) -> str:
         """Return the grid as rows of ``#``, ``.`` and ``D``, which :meth:`from_text` reads back."""

@@ -63,15 +63,18 @@ def read_map(path: str | os.PathLike[str]) -> ParsedMap:
         handle = os.open(source, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except (OSError, ValueError) as error:
         raise MapError(f"{describe(source)}: cannot be opened as a map file: {error}") from error
-    with os.fdopen(handle, "rb") as file:
-        status = os.fstat(file.fileno())
+    try:
+        status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
             raise MapError(f"{source}: is not a regular file")
         if status.st_size > MAX_FILE_BYTES:
             raise MapError(
                 f"{source}: has {status.st_size} bytes, a map file may have {MAX_FILE_BYTES}"
             )
-        data = file.read(MAX_FILE_BYTES + 1)
+        with os.fdopen(handle, "rb", closefd=False) as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    finally:
+        os.close(handle)
     try:
         text = data.decode("ascii")
     except UnicodeDecodeError as error:

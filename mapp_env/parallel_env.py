@@ -235,6 +235,8 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     def _read_actions(self, actions: Mapping[AgentID, int]) -> None:
         """Copy the agents' actions into the array that the kernel reads."""
         names, row, n_actions = self._names, self._actions, self._n_actions
+        if type(actions) is not dict and not isinstance(actions, Mapping):
+            raise ValueError(f"actions must be a dict of agents' actions, got {describe(actions)}")
         if len(actions) != len(names):
             self._refuse_agents(actions)
         for index, name in enumerate(names):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.dynamics import (
-    ALL_PAIRS,
+    BY_COORDINATES,
     WAIT,
     Reward,
     cell_table,
@@ -112,7 +112,7 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
             int(Reward.STEP),
             table,
             distances,
-            ALL_PAIRS,
+            BY_COORDINATES,
         )
         cells = row[:n_agents].tolist()
         for agent, cell in enumerate(cells):

@@ -104,13 +104,14 @@ def check_landmarks(
         If the number is wrong, or a cell is off the grid, a wall, the depot, unreachable or named
         twice.
     """
-    if not isinstance(landmarks, Sequence | np.ndarray) or isinstance(landmarks, str | bytes):
+    if isinstance(landmarks, np.ndarray):
+        landmarks = list(landmarks) if landmarks.ndim > 0 else None
+    if not isinstance(landmarks, Sequence) or isinstance(landmarks, str | bytes):
         raise ValueError(
             f"{name} must be a sequence of cells or of (row, col) pairs, got {describe(landmarks)}"
         )
     low, high = (1, MAX_LANDMARKS) if count is None else (count, count)
-    number = len(landmarks) if np.ndim(landmarks) or not isinstance(landmarks, np.ndarray) else 0
-    if not low <= number <= high:
+    if not low <= len(landmarks) <= high:
         allowed = f"1..{MAX_LANDMARKS}" if count is None else str(count)
         raise ValueError(f"{name} must hold {allowed} cells, got {describe(landmarks)}")
     cells: list[int] = []

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.dynamics import ALL_PAIRS, measure_row, reset_row, row_length, step_row
+from mapp_env.dynamics import measure_row, reset_row, row_length, step_row
 from mapp_env.grid import fill_distances
 from mapp_env.observation import observe_row
 from mapp_env.problem import draw_landmarks
@@ -44,11 +44,13 @@ class Rows:
         self._every_row = np.arange(n_rows)
         # What the kernels take at every call, gathered once: for a single row, looking it up would
         # take longer than a step.
-        distances = task.new_distances(n_rows)
+        n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
+        self._fields = np.empty((n_fields, task.grid.n_cells), np.int32)
         self.sizes = (task.n_agents, task.n_landmarks)
         self.reward = int(task.reward_kind)
         self.kind = int(task.observation_kind)
-        self.tables = (task.table, distances, 0 if task.needs_fields else ALL_PAIRS)
+        view_distances = task.view_distances(self._fields)
+        self.tables = (task.table, *task.reward_distances(self._fields), *view_distances)
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
         # Pictures show where agents have been: their cells at each step, for each row.
@@ -92,7 +94,7 @@ class Rows:
         )
         if task.needs_fields:
             queue = np.empty(task.grid.n_cells, np.int32)
-            _fill_fields(self.state, indices, task.table, *self.sizes, self.tables[1], queue)
+            _fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
         self.limits[indices] = task.max_cycles if limit is None else limit
         if self._trails is not None:
             for index in indices:
@@ -155,7 +157,16 @@ class Rows:
         indices = self._every_row if indices is None else indices
         views = np.empty((len(indices), *self.views_shape), np.float32)
         masks = np.empty((len(indices), *self.masks_shape), np.int8)
-        _observe_rows(self.state, indices, *self.sizes, self.kind, *self.tables, views, masks)
+        _observe_rows(
+            self.state,
+            indices,
+            *self.sizes,
+            self.kind,
+            self.tables[0],
+            *self.tables[3:],
+            views,
+            masks,
+        )
         return views, masks
 
     def measure(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -201,6 +212,8 @@ def step_and_observe(
     table: NDArray[np.int32],
     distances: NDArray[np.int32],
     first_field: int,
+    view_distances: NDArray[np.int32],
+    first_view_field: int,
     views: NDArray[np.float32],
     masks: NDArray[np.int8],
 ) -> tuple[float, bool, bool]:
@@ -216,7 +229,17 @@ def step_and_observe(
         distances,
         first_field,
     )
-    observe_row(row, n_agents, n_landmarks, kind, table, distances, first_field, views, masks)
+    observe_row(
+        row,
+        n_agents,
+        n_landmarks,
+        kind,
+        table,
+        view_distances,
+        first_view_field,
+        views,
+        masks,
+    )
     return result
 
 
@@ -233,6 +256,8 @@ def _step_rows(
     table: NDArray[np.int32],
     distances: NDArray[np.int32],
     first_field: int,
+    view_distances: NDArray[np.int32],
+    first_view_field: int,
     rewards: NDArray[np.float64],
     terminations: NDArray[np.bool_],
     truncations: NDArray[np.bool_],
@@ -241,6 +266,7 @@ def _step_rows(
 ) -> None:
     for index in range(rows.shape[0]):
         field = _field_of(index, first_field, n_landmarks)
+        view_field = _field_of(index, first_view_field, n_landmarks)
         if skip[index]:
             rewards[index] = 0.0
             terminations[index] = False
@@ -251,8 +277,8 @@ def _step_rows(
                 n_landmarks,
                 kind,
                 table,
-                distances,
-                field,
+                view_distances,
+                view_field,
                 views[index],
                 masks[index],
             )
@@ -268,6 +294,8 @@ def _step_rows(
                 table,
                 distances,
                 field,
+                view_distances,
+                view_field,
                 views[index],
                 masks[index],
             )
@@ -303,8 +331,8 @@ def _observe_rows(
 
 @kernel
 def _field_of(index: int, first_field: int, n_landmarks: int) -> int:
-    """Return the line of ``distances`` of a row's first landmark, or ``ALL_PAIRS``."""
-    return first_field if first_field == ALL_PAIRS else index * n_landmarks
+    """Return what a row takes for ``first_field``: a line of its own if there are fields."""
+    return first_field if first_field < 0 else index * n_landmarks
 
 
 @kernel

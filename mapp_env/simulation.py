@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,6 +48,11 @@ class Simulation:
         self._masks_shape = rows.masks_shape
         self._shape = (n_views, *task.view.shape)
         self._records = task.render_mode is not None
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy; the row must be a view of the copied state, not a copy of the view."""
+        self.__dict__.update(state)
+        self._row = self._rows.state[0]
 
     def reset(self, problem: Problem | None, np_random: np.random.Generator) -> None:
         """Start an episode on ``problem``, or on one drawn with a single word of ``np_random``."""
@@ -93,12 +100,12 @@ class Simulation:
     def observe(self) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
         """Return fresh observations, shape (V, ...), and action masks, shape (N, A)."""
         views, masks = self._rows.observe()
-        shaped: NDArray[np.float32] = views.reshape(self._shape)
-        return shaped, masks[0]
+        return views.reshape(self._shape), masks[0]
 
     def state(self) -> NDArray[np.float32]:
         """Return the global observation (R9), shape (N + 2K,)."""
-        return self._row[: self.task.state_length].astype(np.float32)
+        state: NDArray[np.float32] = self._row[: self.task.state_length].astype(np.float32)
+        return state
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success and the three costs of the episode (R8), inf if it was not solved."""

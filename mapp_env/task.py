@@ -11,7 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.dynamics import N_ACTIONS, Reward, cell_table
+from mapp_env.dynamics import (
+    ALL_PAIRS,
+    BY_COORDINATES,
+    MAX_TABLE_CELLS,
+    N_ACTIONS,
+    Reward,
+    cell_table,
+    manhattan_table,
+)
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.grids import grid_names, make_grid
 from mapp_env.observation import Observation, View, view
@@ -31,6 +39,12 @@ RENDER_MODES = ("human", "rgb_array", "ansi")
 
 MAX_BYTES = 4 << 30
 """Largest array of one kind (observations, distance fields) that an environment may need."""
+
+
+Distances = tuple[NDArray[np.int32], int]
+"""What the kernels take for ``distances``, shape (S, C), and ``first_field``."""
+
+NO_DISTANCES = np.zeros((1, 1), np.int32)
 
 
 @dataclass(frozen=True)
@@ -139,25 +153,25 @@ class Task:
         return cell_table(self.grid)
 
     @property
-    def needs_distances(self) -> bool:
-        """Whether rewards or observations look up shortest paths."""
-        return "geodesic" in (self.reward, self.observation)
-
-    @property
     def needs_fields(self) -> bool:
         """Whether paths are kept for each landmark, the grid being too large for all pairs."""
-        return self.needs_distances and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
+        wanted = "geodesic" in (self.reward, self.observation)
+        return wanted and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
 
-    def new_distances(self, n_rows: int) -> NDArray[np.int32]:
-        """Return the distances that kernels read: all pairs (shared) or a field a landmark.
+    def reward_distances(self, fields: NDArray[np.int32]) -> Distances:
+        """Return the distances that the reward looks up."""
+        if self.reward == "geodesic":
+            return self._paths(fields)
+        if self.grid.n_cells <= MAX_TABLE_CELLS:
+            return manhattan_table(self.grid), ALL_PAIRS
+        return NO_DISTANCES, BY_COORDINATES
 
-        Shape (C, C), (n_rows * K, C), or (1, 1) if nothing looks up shortest paths.
-        """
-        if not self.needs_distances:
-            return np.zeros((1, 1), np.int32)
-        if not self.needs_fields:
-            return self.grid.distances
-        return np.empty((n_rows * self.n_landmarks, self.grid.n_cells), np.int32)
+    def view_distances(self, fields: NDArray[np.int32]) -> Distances:
+        """Return the distances that the observation looks up."""
+        return self._paths(fields) if self.observation == "geodesic" else (NO_DISTANCES, ALL_PAIRS)
+
+    def _paths(self, fields: NDArray[np.int32]) -> Distances:
+        return (fields, 0) if self.needs_fields else (self.grid.distances, ALL_PAIRS)
 
     def check_memory(self, n_rows: int) -> None:
         """Refuse a number of rows whose arrays would not fit in memory.

@@ -106,13 +106,13 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
 
     # -- seeds -------------------------------------------------------------------------
 
-    @property  # type: ignore[misc]
+    @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The seed of each row; a single environment reset with it is that row."""
         self._seeds.seed(None, [])
         return tuple(self._seeds.seeds)
 
-    @property
+    @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The generator of each row; up to 64 words of it may have been fetched ahead."""
         self._seeds.seed(None, [])
@@ -269,7 +269,10 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """Return each agent's action in each row, shape (B, N)."""
         joint = self._joint_actions is not None
         shape = (self.num_envs,) if joint else (self.num_envs, self.task.n_agents)
-        array = np.asarray(actions)
+        try:
+            array = np.asarray(actions)
+        except ValueError:
+            array = np.array(None)  # ragged
         if array.shape != shape or array.dtype.kind not in "iu":
             raise ValueError(
                 f"actions must be integers of shape {shape}, "
