@@ -1,0 +1,148 @@
+"""The paper's figures, drawn from a run folder.
+
+Command::
+
+    python baselines/figures.py --run runs/meta_dqn-paper-seed0-...
+
+Figures 2 and 3 (reward and steps per episode) are read from metrics.csv, so they can be drawn
+again from any run, a stopped one too. Figure 4 (routes) is drawn when a training ends.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # files only, so that no screen is needed
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from baselines.evaluate import Evaluation
+from baselines.runs import read_metrics
+from mapp_env import Problem, replay
+from mapp_env.rendering import draw_plan
+
+DPI = 120
+PANEL_WIDTH, PANEL_HEIGHT = 5.8, 6.0  # inches, title and legend of a map of routes included
+EPISODE_COLOUR = "#9db8d2"
+MEAN_COLOUR = "#123a63"
+
+
+def draw_learning_curves(folder: Path, window: int = 30) -> list[Path]:
+    """Draw Fig. 2 and Fig. 3 of a run; `window` episodes go into the running mean.
+
+    Raises
+    ------
+    ValueError
+        If metrics.csv cannot be read or has no finished episode.
+    """
+    metrics = read_metrics(folder)
+    if not metrics.get("episode"):
+        raise ValueError(f"{folder}: no finished episode to draw")
+    panels = (
+        ("fig2_reward.png", "reward", "Reward of the episode", "Fig. 2: reward per episode"),
+        ("fig3_steps.png", "steps", "Steps of the episode", "Fig. 3: steps per episode"),
+    )
+    paths = []
+    for name, column, label, title in panels:
+        figure, axes = plt.subplots(figsize=(7.0, 3.6), layout="constrained")
+        _draw_curve(axes, metrics["episode"], metrics[column], metrics["problem"], window)
+        axes.set(xlabel="Episode", ylabel=label)
+        axes.set_title(title, loc="left", fontsize="medium")
+        paths.append(_save(figure, folder / name))
+    return paths
+
+
+def _draw_curve(
+    axes: Axes,
+    episodes: Sequence[float],
+    values: Sequence[float],
+    problems: Sequence[float],
+    window: int,
+) -> None:
+    new_problem = (np.flatnonzero(np.diff(problems)) + 1).tolist()
+    for index in new_problem:
+        axes.axvline(episodes[index] - 0.5, color="0.9", linewidth=0.8, zorder=0)
+    axes.plot(episodes, values, color=EPISODE_COLOUR, linewidth=0.8, label="episode")
+    if len(values) >= window:
+        mean = np.convolve(values, np.ones(window) / window, mode="valid")
+        label = f"mean of the last {window}"
+        axes.plot(episodes[window - 1 :], mean, color=MEAN_COLOUR, linewidth=1.8, label=label)
+    if new_problem:
+        axes.plot([], [], color="0.85", linewidth=0.8, label="new problem")
+    axes.margins(x=0.01)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False, fontsize="small"
+    )
+
+
+def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
+    """Draw Fig. 4: the routes of each evaluation's first two problems, a row per policy.
+
+    The evaluations must have kept their actions. Nothing is chosen by how it came out: the
+    problems are the first two of the evaluation, solved or not.
+    """
+    n_columns = min(2, *(len(e.landmarks) for e in evaluations.values()))
+    figure, grid_of_axes = plt.subplots(
+        len(evaluations),
+        n_columns,
+        figsize=(PANEL_WIDTH * n_columns, PANEL_HEIGHT * len(evaluations)),
+        squeeze=False,
+    )
+    # By hand: layout engines shrink a square map to make room for the legend below it.
+    figure.subplots_adjust(
+        left=0.02,
+        right=0.98,
+        wspace=0.02,
+        top=1 - 0.55 / (PANEL_HEIGHT * len(evaluations)),
+        bottom=0.8 / (PANEL_HEIGHT * len(evaluations)),
+        hspace=1.35 / (PANEL_HEIGHT - 1.35),
+    )
+    for row, (label, evaluation) in zip(grid_of_axes, evaluations.items(), strict=True):
+        if evaluation.actions is None:
+            raise ValueError(f"evaluations must have kept their actions, {label!r} has not")
+        for index, axes in enumerate(row):
+            problem = Problem(
+                evaluation.setting.grid,
+                tuple(evaluation.landmarks[index].tolist()),
+                evaluation.setting.n_agents,
+                evaluation.setting.max_cycles,
+            )
+            plan = replay(problem, evaluation.actions[: evaluation.steps[index], index])
+            n_visited = sum(len(claims) for claims in plan.claims)
+            if plan.success:
+                outcome = f"all visited in {plan.cover_time} steps, distance {plan.total_distance}"
+            else:
+                outcome = f"not solved: {n_visited} of {len(problem.landmarks)} visited"
+            draw_plan(problem, plan, ax=axes, title=f"({'ab'[index]}) {label}\n{outcome}")
+    return _save(figure, path)
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+    return path
+
+
+@dataclass
+class Args:
+    """Options of drawing a run again."""
+
+    run: Path
+    """the run folder; the figures are written into it"""
+    window: int = 30
+    """episodes in the running mean"""
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Args, description=__doc__)
+    try:
+        for drawn in draw_learning_curves(arguments.run, arguments.window):
+            print(drawn)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from error

@@ -1,0 +1,210 @@
+"""Policies: who commands the agents. Trained networks from files, and two rivals without any.
+
+A policy has one method, ``act(observations) -> actions``: global observations (B, N + 2K) to
+joint actions (B, N).
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+
+from baselines.checks import check_count
+from baselines.networks import NetworkSpec, PaperNetwork, build_network
+from baselines.runs import WEIGHTS_FILE, read_bytes, write_atomically
+from mapp_env import Grid
+
+WEIGHTS_KEY = "mapp_env_policy"  # the one metadata entry of our safetensors files
+WEIGHTS_VERSION = 1
+MAX_WEIGHTS_BYTES = 64 * 1024 * 1024
+MAX_HEADER_BYTES = 1024 * 1024
+
+
+class NetworkPolicy:
+    """Greedy commands of a network: every agent takes the action with its highest score."""
+
+    def __init__(self, network: PaperNetwork) -> None:
+        self.network = network
+        self.spec = network.spec
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Return greedy joint actions (B, N) int64: no guidance, no search.
+
+        Of equal scores the first action is taken.
+
+        Raises
+        ------
+        ValueError
+            If the observations have another shape or hold numbers that are no cells or flags.
+        """
+        checked = check_observations(observations, self.spec)
+        with torch.inference_mode():
+            scores = self.network(torch.from_numpy(checked))
+            actions: np.ndarray = scores.argmax(dim=-1).numpy()
+        return actions
+
+
+class RandomPolicy:
+    """Every agent takes each action with the same probability."""
+
+    def __init__(self, n_agents: int, n_actions: int, rng: np.random.Generator) -> None:
+        self.n_agents, self.n_actions, self.rng = n_agents, n_actions, rng
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Return joint actions (B, N), whatever is seen."""
+        return self.rng.integers(self.n_actions, size=(len(observations), self.n_agents))
+
+
+class NearestLandmarkPolicy:
+    """Every agent walks a shortest path to the unvisited landmark nearest to it.
+
+    Of equally near landmarks the one given first counts, of equally good moves the first action.
+    Nobody coordinates: agents that stand together walk together.
+    """
+
+    def __init__(self, grid: Grid, n_agents: int, n_landmarks: int) -> None:
+        # The table of first moves has one entry per pair of cells.
+        check_count("n_cells", grid.n_cells, 2, 4096)
+        self.n_agents, self.n_landmarks = n_agents, n_landmarks
+        distances = np.asarray(grid.distances)  # (C, C), -1 unreachable
+        self.distances = np.where(distances < 0, np.iinfo(np.int32).max, distances)
+        after = self.distances[np.asarray(grid.moves)]  # (C, 4, C)
+        self.first_moves = after.argmin(axis=1)  # (C, C): the action that comes nearest
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Return joint actions (B, N)."""
+        n, k = self.n_agents, self.n_landmarks
+        cells = observations[:, :n].astype(np.int64)
+        landmarks = observations[:, n : n + k].astype(np.int64)
+        visited = observations[:, n + k :] > 0.5
+        steps = self.distances[cells[:, :, None], landmarks[:, None, :]].astype(np.int64)
+        steps[np.broadcast_to(visited[:, None, :], steps.shape)] = np.iinfo(np.int64).max
+        chosen = np.take_along_axis(landmarks, steps.argmin(axis=-1), axis=1)
+        actions: np.ndarray = self.first_moves[cells, chosen]
+        return actions
+
+
+def check_observations(observations: np.ndarray, spec: NetworkSpec) -> np.ndarray:
+    """Return the observations as a fresh float32 array when they can come from the env.
+
+    Raises
+    ------
+    ValueError
+        If the shape is not (B, N + 2K), a cell is none of the grid's, or a flag is not 0 or 1.
+    """
+    array = np.asarray(observations)
+    if array.ndim != 2 or array.shape[1] != spec.observation_size or array.dtype.kind not in "fiub":
+        raise ValueError(
+            f"observations must be numbers of shape (B, {spec.observation_size}), got "
+            f"{array.dtype} of shape {array.shape}"
+        )
+    n_cell_inputs = spec.n_agents + spec.n_landmarks
+    cells, flags = array[:, :n_cell_inputs], array[:, n_cell_inputs:]
+    if not ((cells >= 0) & (cells < spec.n_cells) & (cells == np.floor(cells))).all():
+        raise ValueError(
+            f"observations must have cells in 0..{spec.n_cells - 1}, got something else"
+        )
+    if not ((flags == 0) | (flags == 1)).all():
+        raise ValueError("observations must have visited flags 0 or 1, got something else")
+    return array.astype(np.float32)
+
+
+def save_policy(path: Path, network: PaperNetwork) -> None:
+    """Write a network's weights and its spec to a safetensors file, in one piece."""
+    # One metadata entry only: safetensors writes several in no fixed order.
+    about = json.dumps({"version": WEIGHTS_VERSION, **network.spec.as_dict()}, sort_keys=True)
+    tensors = {name: t.detach().contiguous() for name, t in network.state_dict().items()}
+    write_atomically(path, safetensors.torch.save(tensors, {WEIGHTS_KEY: about}))
+
+
+def load_policy(path: str | Path) -> NetworkPolicy:
+    """Load a trained policy.
+
+    Parameters
+    ----------
+    path
+        A run folder, or a weights file.
+
+    Returns
+    -------
+    NetworkPolicy
+        Acts greedily: ``.act(observations (B, N + 2K)) -> actions (B, N)``.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, or it is damaged, was written by something else, or its weights
+        have other names, shapes or dtypes than its network, or are not finite. No code is run
+        from the file.
+    """
+    path = Path(path)
+    file = path / WEIGHTS_FILE if path.is_dir() else path
+    if not file.exists():
+        raise ValueError(f"policy must be a run folder or a weights file, got {str(path)!r}")
+    content = read_bytes(file, MAX_WEIGHTS_BYTES)
+    spec = read_spec(file, content)
+    try:
+        weights = safetensors.torch.load(content)
+    except Exception as error:  # safetensors raises its own error type, a plain Exception
+        raise ValueError(f"{file}: damaged weights: {error}") from error
+
+    network = build_network(spec)
+    expected = network.state_dict()
+    if weights.keys() != expected.keys():
+        missing, extra = expected.keys() - weights.keys(), weights.keys() - expected.keys()
+        raise ValueError(
+            f"{file}: other weights than a {spec.kind!r} network has: "
+            f"missing {sorted(missing)}, unknown {sorted(extra)}"
+        )
+    for name, wanted in expected.items():
+        found = weights[name]
+        if found.shape != wanted.shape or found.dtype != wanted.dtype:
+            raise ValueError(
+                f"{file}: {name}: got {found.dtype} of shape {tuple(found.shape)}, expected "
+                f"{wanted.dtype} of shape {tuple(wanted.shape)}"
+            )
+        if not torch.isfinite(found).all():
+            raise ValueError(f"{file}: {name}: holds NaN or infinite weights")
+    network.load_state_dict(weights)
+    return NetworkPolicy(network.eval())
+
+
+def read_spec(file: Path, content: bytes) -> NetworkSpec:
+    """Read which network the weights in a safetensors file belong to, from its header.
+
+    Raises
+    ------
+    ValueError
+        If the header is damaged, has an entry twice, or is not one of ours.
+    """
+    length = struct.unpack("<Q", content[:8])[0] if len(content) >= 8 else 0
+    if not 2 <= length <= min(MAX_HEADER_BYTES, len(content) - 8):
+        raise ValueError(f"{file}: damaged weights: this is not a safetensors file")
+    try:
+        header = parse_json(content[8 : 8 + length])
+        metadata = header.get("__metadata__") if isinstance(header, dict) else None
+        text = metadata.get(WEIGHTS_KEY) if isinstance(metadata, dict) else None
+        if not isinstance(text, str):
+            raise ValueError(f"foreign weights: the header has no {WEIGHTS_KEY!r}")
+        about = parse_json(text)
+        if not isinstance(about, dict) or about.pop("version", None) != WEIGHTS_VERSION:
+            raise ValueError(f"foreign weights: {WEIGHTS_KEY} is not of version {WEIGHTS_VERSION}")
+        return NetworkSpec(**about)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"{file}: {error}") from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON, but refuse an entry that is there twice: two readers could differ on it."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        entries = dict(pairs)
+        if len(entries) != len(pairs):
+            raise ValueError("damaged header: an entry is there twice")
+        return entries
+
+    return json.loads(text, object_pairs_hook=unique)

@@ -1,0 +1,287 @@
+"""Run folders: what a training leaves behind, written so that a stopped run stays readable.
+
+A run folder holds
+
+=================== ==============================================================
+config.json         every option, the training problems, versions, commit
+metrics.csv         one row per finished episode; flushed at every row
+policy.safetensors  the network's weights (``policy.load_policy`` reads them)
+timing.json         where the time went; the only file with wall times of the run
+evaluation.csv/.md  the table over unseen problems
+fig*.png            the paper's figures 2, 3 and 4
+=================== ==============================================================
+
+metrics.csv holds no wall time: two runs with one seed write the same bytes.
+"""
+
+import csv
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, TextIO
+
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.csv"
+WEIGHTS_FILE = "policy.safetensors"
+TIMING_FILE = "timing.json"
+MAX_TEXT_BYTES = 64 * 1024 * 1024  # no file of ours comes near; refuse to read more
+
+VERSIONED = ("mapp_env", "numpy", "numba", "torch", "gymnasium", "pettingzoo", "safetensors")
+
+
+class RunFolder:
+    """A new folder for one training.
+
+    Parameters
+    ----------
+    folder
+        Where; it must not exist, or be empty.
+    columns
+        The columns of metrics.csv.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds something already, or cannot be made.
+    """
+
+    def __init__(self, folder: Path, columns: Sequence[str]) -> None:
+        self.folder = folder
+        self.columns = tuple(columns)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            occupied = any(folder.iterdir())
+        except OSError as error:
+            raise ValueError(f"out must be a folder that can be made: {error}") from error
+        if occupied:
+            raise ValueError(
+                f"out must be a new or empty folder, got {str(folder)!r}, which is not empty"
+            )
+        self._metrics: TextIO = (folder / METRICS_FILE).open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._metrics, lineterminator="\n")
+        self._write_row(self.columns)
+
+    def path(self, name: str) -> Path:
+        """Where the file called `name` is in this run."""
+        return self.folder / name
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Write config.json: `config`, and what it ran on."""
+        self.write_json(CONFIG_FILE, {**config, "environment": describe_environment()})
+
+    def write_json(self, name: str, content: object) -> None:
+        """Write a JSON file in one piece."""
+        text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+        write_atomically(self.path(name), text.encode())
+
+    def log(self, row: Mapping[str, object]) -> None:
+        """Append one row to metrics.csv and hand it to the operating system at once."""
+        self._write_row([row[column] for column in self.columns])
+
+    def _write_row(self, values: Sequence[object]) -> None:
+        self._writer.writerow([f"{v:.9g}" if isinstance(v, float) else v for v in values])
+        self._metrics.flush()
+
+    def close(self) -> None:
+        """Close metrics.csv."""
+        self._metrics.close()
+
+
+def default_folder(algorithm: str, preset: str, seed: int) -> Path:
+    """Name a run folder after what is run and the time."""
+    return Path("runs") / f"{algorithm}-{preset}-seed{seed}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Read a run's config.json.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing, too large, or not a JSON object.
+    """
+    path = folder / CONFIG_FILE
+    try:
+        config = json.loads(read_bytes(path, MAX_TEXT_BYTES))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a readable config: {error}") from error
+    if not isinstance(config, dict):
+        raise ValueError(f"{path}: not a readable config: it is not a JSON object")
+    return config
+
+
+def read_metrics(folder: Path) -> dict[str, list[float]]:
+    """Read a run's metrics.csv by columns; an empty field is NaN, a torn last row is left out.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing, too large, or not a table of numbers.
+    """
+    path = folder / METRICS_FILE
+    text = read_bytes(path, MAX_TEXT_BYTES).decode("utf-8", errors="replace")
+    lines = text[: text.rfind("\n") + 1].splitlines()
+    if not lines:
+        raise ValueError(f"{path}: no header line")
+    columns = lines[0].split(",")
+    table: dict[str, list[float]] = {column: [] for column in columns}
+    for number, line in enumerate(lines[1:], start=2):
+        fields = line.split(",")
+        if len(fields) != len(columns):
+            raise ValueError(
+                f"{path}, line {number}: {len(fields)} fields, expected {len(columns)}"
+            )
+        for column, field in zip(columns, fields, strict=True):
+            try:
+                table[column].append(float(field) if field else float("nan"))
+            except ValueError:
+                raise ValueError(f"{path}, line {number}: {column}: not a number") from None
+    return table
+
+
+def read_bytes(path: Path, max_bytes: int) -> bytes:
+    """Read a regular file of at most `max_bytes`.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, it is not a regular one, or it is larger.
+    """
+    try:
+        if not path.is_file():  # also keeps us from waiting on a pipe
+            raise ValueError(f"{path}: not a regular file")
+        with path.open("rb") as file:
+            content = file.read(max_bytes + 1)
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from error
+    if len(content) > max_bytes:
+        raise ValueError(f"{path}: larger than {max_bytes} bytes")
+    return content
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file so that, whatever happens, it is the old one or the new one, never a part.
+
+    The content goes to a temporary file beside it, to the disk, and then takes the name.
+    """
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)  # mkstemp hides it from the group; results are for sharing
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    if os.name == "posix":  # the new name is on the disk only when the folder is
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def describe_environment() -> dict[str, Any]:
+    """Versions, commit, machine and command: what a reader needs to run this again."""
+    versions: dict[str, str | None] = {"python": platform.python_version()}
+    for package in VERSIONED:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = None
+    return {
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": sys.argv,
+        "versions": versions,
+        "commit": git_commit(),
+        "platform": platform.platform(),
+        "cpu_count": os.cpu_count(),
+    }
+
+
+def git_commit() -> str | None:
+    """Return the commit these baselines are at, "+changes" if edited since; None without git."""
+    answers = []
+    for command in (["rev-parse", "HEAD"], ["status", "--porcelain"]):
+        try:
+            answer = subprocess.run(
+                ["git", *command],
+                cwd=Path(__file__).parent,
+                capture_output=True,
+                text=True,
+                timeout=10,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError):
+            return None
+        answers.append(answer.stdout.strip())
+    return answers[0] + ("+changes" if answers[1] else "")
+
+
+class StopSignals:
+    """Turns Ctrl-C and SIGTERM into a question the training loop asks between two steps.
+
+    The first signal is only noted, so that weights and metrics are never caught half-way; a
+    second one interrupts as usual.
+    """
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+
+    def __enter__(self) -> "StopSignals":
+        if threading.current_thread() is threading.main_thread():  # Python allows it only there
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+
+class Stopwatch:
+    """Adds up where the time goes: each lap is booked under a name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._start = self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Book the time since the last lap under `name`."""
+        now = time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
+        self._last = now
+
+    @property
+    def total(self) -> float:
+        """Seconds from the start to the last lap."""
+        return self._last - self._start
+
+    def __str__(self) -> str:
+        total = max(self.total, 1e-9)
+        parts = [f"{name} {100 * s / total:.0f} %" for name, s in self.seconds.items()]
+        return f"{self.total:.1f} s: " + ", ".join(parts)

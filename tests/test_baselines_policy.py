@@ -1,0 +1,200 @@
+"""Policies: what is saved is what is loaded, and nothing else gets in."""
+
+import json
+import os
+import struct
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.policy import (
+    WEIGHTS_KEY,
+    NearestLandmarkPolicy,
+    NetworkPolicy,
+    RandomPolicy,
+    load_policy,
+    save_policy,
+)
+from mapp_env import make_grid
+
+SPEC = NetworkSpec("paper", 3, 5, 4, 49, 16)
+ABOUT = json.dumps({"version": 1, **SPEC.as_dict()})
+
+
+@pytest.fixture
+def network():
+    return build_network(SPEC, torch_generator(np.random.SeedSequence(0)))
+
+
+@pytest.fixture
+def weights(network):
+    return {name: tensor.clone() for name, tensor in network.state_dict().items()}
+
+
+def observations(n: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    cells, flags = rng.integers(49, size=(n, 8)), rng.integers(2, size=(n, 5))
+    return np.concatenate([cells, flags], axis=1).astype(np.float32)
+
+
+def write(path, tensors, about=ABOUT):
+    path.write_bytes(safetensors.torch.save(tensors, {WEIGHTS_KEY: about} if about else None))
+    return path
+
+
+def test_loaded_policy_acts_like_the_saved_network(tmp_path, network):
+    """From a file or from a run folder, actions are each agent's argmax of the same scores."""
+    save_policy(tmp_path / "policy.safetensors", network)
+    seen = observations(200)
+    with torch.no_grad():
+        expected = network(torch.from_numpy(seen)).argmax(dim=-1).numpy()
+    for path in (tmp_path, tmp_path / "policy.safetensors", str(tmp_path)):
+        actions = load_policy(path).act(seen)
+        assert actions.shape == (200, 3)
+        np.testing.assert_array_equal(actions, expected)
+
+
+def test_saving_twice_writes_the_same_bytes(tmp_path, network):
+    """The file depends on nothing but the network, and no temporary file stays behind."""
+    for name in ("one", "two"):
+        save_policy(tmp_path / name, network)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    assert sorted(os.listdir(tmp_path)) == ["one", "two"]
+
+
+def test_start_weights_follow_the_seed():
+    """One seed gives one network, another seed another one."""
+    one, same, other = (
+        build_network(SPEC, torch_generator(np.random.SeedSequence(seed))).state_dict()
+        for seed in (1, 1, 2)
+    )
+    assert all(torch.equal(one[name], same[name]) for name in one)
+    assert not any(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+def test_weights_that_are_not_finite_are_refused(tmp_path, weights, value):
+    """One NaN or infinite weight is enough, and the message names its tensor."""
+    weights["layers.2.bias"][3] = value
+    with pytest.raises(ValueError, match=r"layers\.2\.bias: holds NaN or infinite"):
+        load_policy(write(tmp_path / "w", weights))
+
+
+def test_weights_of_other_shapes_dtypes_or_names_are_refused(tmp_path, weights):
+    """Every deviation from the network's own tensors is refused by the tensor's name."""
+    shape = {**weights, "layers.0.weight": torch.zeros(16, 12)}
+    with pytest.raises(ValueError, match=r"layers\.0\.weight: got .*\(16, 12\)"):
+        load_policy(write(tmp_path / "shape", shape))
+    dtype = {**weights, "layers.4.bias": weights["layers.4.bias"].double()}
+    with pytest.raises(ValueError, match=r"layers\.4\.bias: got torch\.float64"):
+        load_policy(write(tmp_path / "dtype", dtype))
+    extra = {**weights, "surprise": torch.zeros(1)}
+    with pytest.raises(ValueError, match=r"unknown .*surprise"):
+        load_policy(write(tmp_path / "extra", extra))
+    del weights["layers.0.bias"]
+    with pytest.raises(ValueError, match=r"missing .*layers\.0\.bias"):
+        load_policy(write(tmp_path / "missing", weights))
+
+
+@pytest.mark.parametrize(
+    "about",
+    [
+        None,
+        "",
+        "{",
+        "[1]",
+        "[" * 100_000,
+        '{"version": 1}',
+        ABOUT.replace('"version": 1', '"version": 2'),
+        ABOUT.replace("16", "1e999"),
+        ABOUT.replace("16", "NaN"),
+        ABOUT.replace("16", "999999999"),
+        ABOUT.replace('"n_agents": 3', '"n_agents": true'),
+        ABOUT.replace('"kind": "paper"', '"kind": "other"'),
+        ABOUT.replace("{", '{"n_agents": 3, ', 1),
+    ],
+)
+def test_foreign_or_damaged_descriptions_are_refused(tmp_path, weights, about):
+    """Weights that do not say which network they are, or say it strangely, are refused."""
+    path = write(tmp_path / "w", weights, about)
+    with pytest.raises(ValueError, match=str(path)):
+        load_policy(path)
+
+
+def test_damaged_files_are_refused(tmp_path, network):
+    """Cut at any length, or with any early byte changed to a brace, a file never loads wrong."""
+    save_policy(tmp_path / "good", network)
+    good = (tmp_path / "good").read_bytes()
+    path = tmp_path / "bad"
+    for length in (0, 1, 7, 8, 9, 100, 1000, len(good) - 1):
+        path.write_bytes(good[:length])
+        with pytest.raises(ValueError, match="bad"):
+            load_policy(path)
+    path.write_bytes(good + b"\0")
+    with pytest.raises(ValueError, match="damaged"):
+        load_policy(path)
+    path.write_bytes(struct.pack("<Q", 1 << 62) + good[8:])
+    with pytest.raises(ValueError, match="not a safetensors"):
+        load_policy(path)
+    path.write_bytes(b"\x80\x04\x95 a pickle is refused too" * 10)
+    with pytest.raises(ValueError, match="not a safetensors"):
+        load_policy(path)
+
+
+def test_missing_and_irregular_files_are_refused(tmp_path):
+    """No file, an empty folder and a pipe are refused at once."""
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("nothing", "", "pipe"):
+        with pytest.raises(ValueError, match=r"regular file|run folder or a weights file"):
+            load_policy(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.zeros(13, np.float32),
+        np.zeros((2, 12), np.float32),
+        np.full((1, 13), np.nan, np.float32),
+        np.full((1, 13), 49, np.float32),
+        np.full((1, 13), -1, np.float32),
+        np.full((1, 13), 0.5, np.float32),
+        np.full((1, 13), 2, np.float32),
+        np.array([["a"] * 13]),
+    ],
+)
+def test_observations_the_env_cannot_give_are_refused(network, bad):
+    """Wrong shapes, cells off the grid and flags that are none are refused by name."""
+    with pytest.raises(ValueError, match=r"^observations must"):
+        NetworkPolicy(network).act(bad)
+
+
+def test_random_policy_takes_every_action_equally_often():
+    """Over many draws each action has its quarter."""
+    policy = RandomPolicy(3, 4, np.random.default_rng(0))
+    actions = policy.act(observations(4000))
+    assert actions.shape == (4000, 3)
+    np.testing.assert_allclose(np.bincount(actions.ravel()) / actions.size, 0.25, atol=0.02)
+
+
+def test_nearest_landmark_policy_comes_one_step_nearer():
+    """Every agent's move takes it one step nearer to the unvisited landmark nearest to it."""
+    grid = make_grid("paper-7x7")
+    rng = np.random.default_rng(0)
+    free = np.append(grid.reachable, grid.depot)
+    cells = rng.choice(free, (500, 3))
+    landmarks = np.array([rng.permutation(grid.reachable)[:5] for _ in range(500)])
+    visited = rng.random((500, 5)) < 0.5
+    visited[np.arange(500), rng.integers(5, size=500)] = False
+    seen = np.concatenate([cells, landmarks, visited], axis=1).astype(np.float32)
+    actions = NearestLandmarkPolicy(grid, 3, 5).act(seen)
+    for row in range(500):
+        left = landmarks[row][~visited[row]]
+        for agent in range(3):
+            here = cells[row, agent]
+            there = grid.moves[here, actions[row, agent]]
+            nearest = grid.distances[here, left].min()
+            if nearest:
+                assert grid.distances[there, left].min() == nearest - 1
