@@ -93,10 +93,9 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         self.render_mode = task.render_mode
         self.possible_agents = [f"agent_{index}" for index in range(task.n_agents)]
         self.agents: list[AgentID] = []
-        self.observation_spaces = {
-            agent: Box(task.view.low, task.view.high, dtype=np.float32)
-            for agent in self.possible_agents
-        }
+        # One space for all agents: on a large grid its bounds are the largest arrays there are.
+        space = Box(task.view.low, task.view.high, dtype=np.float32)
+        self.observation_spaces = dict.fromkeys(self.possible_agents, space)
         self.action_spaces = {agent: Discrete(task.n_actions) for agent in self.possible_agents}
         self.state_space = Box(task.state_view.low, task.state_view.high, dtype=np.float32)
         self._names = tuple(self.possible_agents)

@@ -387,17 +387,18 @@ def _fill_fields(
 
 
 @kernel
-def find_bad_action(actions: NDArray[np.int64], n_actions: int) -> int:
-    """Return the flat position of the first action outside ``0..n_actions - 1``, or -1.
+def find_bad_action(actions: NDArray[np.uint64], n_actions: int) -> int:
+    """Return the position of the first action outside ``0..n_actions - 1``, or -1.
 
-    Shape: ``actions`` (M,).
+    Shape: ``actions`` (M,), int64 seen as uint64, so that a negative action is a huge one.
     """
-    bad = False
+    limit = np.uint64(n_actions)
+    highest = np.uint64(0)
     for action in actions:
         # No early exit: the loop without one is vectorised, and bad actions are rare.
-        bad |= (action < 0) | (action >= n_actions)
-    if bad:
+        highest = max(highest, action)
+    if highest >= limit:
         for position, action in enumerate(actions):
-            if action < 0 or action >= n_actions:
+            if action >= limit:
                 return position
     return -1

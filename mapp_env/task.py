@@ -37,7 +37,7 @@ __all__ = ["RENDER_MODES", "Task", "find_grid"]
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
 
-MAX_BYTES = 4 << 30
+MAX_BYTES = 1 << 30
 """Largest array of one kind (observations, distance fields) that an environment may need."""
 
 
@@ -179,7 +179,7 @@ class Task:
         Raises
         ------
         ValueError
-            If the observations of one step, or the distance fields, take more than 4 GiB.
+            If the observations of one step, or the distance fields, take more than 1 GiB.
         """
         views = 1 if self.observation_kind == Observation.GLOBAL else self.n_agents
         size = 4 * n_rows * views * int(np.prod(self.view.shape))

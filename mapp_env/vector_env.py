@@ -152,6 +152,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """
         seeds = self._seeds.check(seed)
         mask = self._check_reset_mask(options)
+        if not self._started and not mask.all():
+            raise ValueError("options['reset_mask'] must be all True in the first reset")
         landmarks, limit = self._check_problems(options)
         indices = np.flatnonzero(mask)
         self._seeds.seed(seeds, indices.tolist())
@@ -209,7 +211,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if mode == AutoresetMode.NEXT_STEP:
             skip = self._ended
             starting = np.flatnonzero(skip)
-            self._rows.start(starting, self._seeds.next_words(starting))
+            if len(starting):
+                self._rows.start(starting, self._seeds.next_words(starting))
         rewards, terminations, truncations, views, masks = self._rows.step(joint_actions, skip)
         observations = views.reshape(self._observations_shape)
         self._ended = terminations | truncations
@@ -280,7 +283,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             )
         n_actions = self.task.n_actions if self._joint_actions is None else len(self._joint_actions)
         array = np.ascontiguousarray(array, np.int64)
-        bad = find_bad_action(array.reshape(-1), n_actions)
+        bad = find_bad_action(array.reshape(-1).view(np.uint64), n_actions)
         if bad >= 0:
             place = ", ".join(str(int(index)) for index in np.unravel_index(bad, shape))
             raise ValueError(
