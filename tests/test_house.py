@@ -1,0 +1,212 @@
+"""The house keeps its order: who may import whom, how files are called, what is documented."""
+
+from __future__ import annotations
+
+import ast
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import mapp_env
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+PACKAGE = REPOSITORY / "mapp_env"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+# From the bottom up; a file may import what stands lower, or beside it.
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("validation", "compiled"),
+    ("map_format",),
+    ("grid",),
+    ("grids",),
+    ("problem",),
+    ("dynamics", "observation", "plan", "solvers", "rendering", "task"),
+    ("rows", "row_seeds"),
+    ("simulation", "parallel_env", "central_env", "vector_env"),
+    ("mapp_v0",),
+    ("__init__",),
+)
+FACES = {"parallel_env", "central_env", "vector_env", "mapp_v0", "__init__"}
+DRAWING = {"PIL", "matplotlib", "pygame"}
+
+
+def module_name(path: Path) -> str:
+    """Return a file's dotted name inside the package: ``rendering.ansi``, ``__init__``."""
+    parts = list(path.relative_to(PACKAGE).with_suffix("").parts)
+    if len(parts) > 1 and parts[-1] == "__init__":
+        parts.pop()
+    return ".".join(parts)
+
+
+def layer(module: str) -> int:
+    """Return how high a module stands."""
+    top = module.split(".")[0]
+    for level, names in enumerate(LAYERS):
+        if top in names:
+            return level
+    raise AssertionError(f"{module} has no place in the house: see DESIGN, section 5")
+
+
+@functools.cache
+def imports(path: Path) -> tuple[tuple[str, bool], ...]:
+    """Return what a file imports, dotted, and whether already when it is imported itself."""
+    return tuple(_imports(ast.parse(path.read_text(encoding="utf-8")), True))
+
+
+def _imports(node: ast.AST, at_import: bool) -> Iterator[tuple[str, bool]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import):
+            yield from ((alias.name, at_import) for alias in child.names)
+        elif isinstance(child, ast.ImportFrom):
+            assert child.level == 0, "imports are absolute here"
+            yield from ((f"{child.module}.{alias.name}", at_import) for alias in child.names)
+        elif isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        else:
+            inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            yield from _imports(child, at_import and not inside)
+
+
+def own(name: str) -> str | None:
+    """Return the module of the package that an imported name comes from, or None."""
+    parts = name.split(".")
+    if parts[0] != "mapp_env":
+        return None
+    for length in range(len(parts) - 1, 0, -1):
+        path = PACKAGE.joinpath(*parts[1 : length + 1])
+        if path.with_suffix(".py").is_file() or (path / "__init__.py").is_file():
+            return ".".join(parts[1 : length + 1])
+    return "__init__"
+
+
+def test_the_reader_reads() -> None:
+    """The reader of imports sees the package's files and what they are known to import."""
+    assert len(FILES) >= 10
+    assert ("numpy", True) in imports(PACKAGE / "dynamics.py")
+    assert own("mapp_env.grid.Grid") == "grid"
+    assert own("mapp_env.mapp_v0") == "mapp_v0"
+    assert own("mapp_env.Grid") == "__init__"
+    assert own("numpy.typing") is None
+    assert any(own(name) == "dynamics" for name, _ in imports(PACKAGE / "observation.py"))
+    assert {module_name(path).split(".")[0] for path in FILES} >= {"grid", "problem", "dynamics"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_imports_run_downwards(path: Path) -> None:
+    """No file imports from a layer above its own, and none imports the package's top."""
+    here = module_name(path)
+    for name, _ in imports(path):
+        source = own(name)
+        if source is None:
+            continue
+        assert source != "__init__", f"{here} imports {name} from the top of the package"
+        assert layer(source) <= layer(here), f"{here} imports {source}, which stands above it"
+
+
+def test_imports_have_no_cycle() -> None:
+    """No file imports itself by way of others, not even beside each other in one layer."""
+    graph = {module_name(path): {own(name) for name, _ in imports(path)} - {None} for path in FILES}
+    done: set[str] = set()
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert module not in trail, f"cycle: {' -> '.join((*trail, module))}"
+        if module in done:
+            return
+        for source in sorted(name for name in graph[module] if name):
+            visit(source, (*trail, module))
+        done.add(module)
+
+    for module in graph:
+        visit(module, ())
+    assert done == set(graph)
+
+
+@pytest.mark.parametrize("path", FILES, ids=module_name)
+def test_libraries_stay_in_their_places(path: Path) -> None:
+    """No torch; PettingZoo and Gymnasium in the faces; drawing in rendering and never early.
+
+    Gymnasium's seeding is allowed everywhere: it is where generators come from.
+    """
+    here = module_name(path)
+    for name, at_import in imports(path):
+        library = name.split(".")[0]
+        assert library not in {"torch", "baselines", "tests", "examples", "benchmarks"}
+        assert library not in {"random", "pickle", "supersuit"}, f"{here} imports {library}"
+        if library in {"pettingzoo", "gymnasium"}:
+            seeding = name.startswith("gymnasium.utils.seeding")
+            assert here in FACES or seeding, f"{here} imports {name}"
+        if library in DRAWING:
+            assert here.startswith("rendering"), f"{here} imports {name}"
+            if here == "rendering":
+                assert not at_import, "importing mapp_env.rendering draws nothing"
+
+
+@pytest.mark.parametrize("folder", ["mapp_env", "baselines", "examples", "benchmarks", "tests"])
+def test_no_file_without_a_subject(folder: str) -> None:
+    """No file is called utils, helpers, misc or common: each is called after what it holds."""
+    for path in (REPOSITORY / folder).rglob("*.py"):
+        assert path.stem.strip("_") not in {"util", "utils", "helper", "helpers", "misc", "common"}
+
+
+def public_definitions() -> list[tuple[str, ast.AST]]:
+    """Return every module, and every public class, function and method of the package."""
+    found: list[tuple[str, ast.AST]] = []
+    for path in FILES:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found.append((module_name(path), tree))
+        stack: list[tuple[str, ast.AST]] = [(module_name(path), tree)]
+        while stack:
+            where, node = stack.pop()
+            for child in ast.iter_child_nodes(node):
+                if not isinstance(child, (ast.ClassDef, ast.FunctionDef)):
+                    continue
+                if child.name.startswith("_"):
+                    continue
+                name = f"{where}.{child.name}"
+                decorators = {ast.unparse(decorator) for decorator in child.decorator_list}
+                setter = any(text.endswith(".setter") for text in decorators)
+                if not setter and not decorators & {"overload", "override"}:
+                    found.append((name, child))
+                if isinstance(child, ast.ClassDef):
+                    stack.append((name, child))
+    return found
+
+
+def test_public_names_are_documented() -> None:
+    """Every module and every public class, function and method has a docstring of its own."""
+    definitions = public_definitions()
+    assert len(definitions) >= 60
+    bare = [name for name, node in definitions if not ast.get_docstring(node)]  # type: ignore[arg-type]
+    assert bare == []
+
+
+def test_no_assert_and_no_eval_for_users() -> None:
+    """The package checks with exceptions, not asserts, and evaluates no text."""
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            assert not isinstance(node, ast.Assert), f"{module_name(path)}:{node.lineno}"
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in {"eval", "exec"}, f"{module_name(path)}:{node.lineno}"
+
+
+def test_all_names_exist() -> None:
+    """Every name of __all__ exists, and the names that the design fixes are among them."""
+    for name in mapp_env.__all__:
+        assert hasattr(mapp_env, name), name
+    fixed = {"Grid", "Problem", "make_grid", "make_vec", "mapp_v0", "replay"}
+    assert fixed <= set(mapp_env.__all__)
+    for name in ("parallel_env", "env", "raw_env"):
+        assert callable(getattr(mapp_env.mapp_v0, name))
+
+
+def test_every_test_says_what_it_holds() -> None:
+    """Every test function has a docstring of one sentence or more."""
+    count = 0
+    for path in sorted((REPOSITORY / "tests").glob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                count += 1
+                assert ast.get_docstring(node), f"{path.name}: {node.name}"
+    assert count >= 80
