@@ -37,6 +37,7 @@ __all__ = [
     "FAR",
     "HOME",
     "MAX_TABLE_CELLS",
+    "NO_DISTANCES",
     "N_ACTIONS",
     "ROW",
     "WAIT",
@@ -62,6 +63,11 @@ BY_COORDINATES = -2  # nowhere: Manhattan distances are computed from rows and c
 MAX_TABLE_CELLS = (
     256  # largest grid for a table of Manhattan distances: it should stay in the cache
 )
+
+# Distances are read-only arrays without exception: numba would compile a second version of every
+# kernel for others.
+NO_DISTANCES = np.zeros((1, 1), np.int32)
+NO_DISTANCES.flags.writeable = False
 
 FAR = np.int32(1 << 30)  # more than any distance on a grid
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.dynamics import (
     BY_COORDINATES,
+    NO_DISTANCES,
     WAIT,
     Reward,
     cell_table,
@@ -97,7 +98,6 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
     reset_row(row, landmarks, grid.depot, n_agents, n_landmarks)
     flags = row[n_agents + n_landmarks : n_agents + 2 * n_landmarks]
     limit = len(actions) if problem.max_cycles is None else problem.max_cycles
-    distances = np.zeros((1, 1), np.int32)
     routes = [[grid.depot] for _ in range(n_agents)]
     tours: list[tuple[int, ...]] = [()] * n_agents
     claims: list[list[int]] = [[] for _ in range(n_agents)]
@@ -111,7 +111,7 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
             limit,
             int(Reward.STEP),
             table,
-            distances,
+            NO_DISTANCES,
             BY_COORDINATES,
         )
         cells = row[:n_agents].tolist()

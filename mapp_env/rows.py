@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,14 +51,23 @@ class Rows:
         self.sizes = (task.n_agents, task.n_landmarks)
         self.reward = int(task.reward_kind)
         self.kind = int(task.observation_kind)
-        view_distances = task.view_distances(self._fields)
-        self.tables = (task.table, *task.reward_distances(self._fields), *view_distances)
+        self.tables = self._find_tables()
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
         # Pictures show where agents have been: their cells at each step, for each row.
         self._trails: list[list[tuple[int, ...]]] | None = None
         if task.render_mode is not None:
             self._trails = [[] for _ in range(n_rows)]
+
+    def _find_tables(self) -> tuple[Any, ...]:
+        """Return the table and the distances of reward and views that the kernels read."""
+        task, fields = self.task, self._fields
+        return (task.table, *task.reward_distances(fields), *task.view_distances(fields))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy; what the kernels read must be views of it, not copies of views."""
+        self.__dict__.update(state)
+        self.tables = self._find_tables()
 
     def start(
         self,

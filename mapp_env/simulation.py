@@ -41,18 +41,23 @@ class Simulation:
         self.running = False
         rows = Rows(task, 1, n_views)
         self._rows = rows
-        self._row = rows.state[0]
         self._limit = task.max_cycles
-        self._rules = (*rows.sizes, rows.reward, rows.kind, *rows.tables)
+        self._bind()
         self._views_shape = rows.views_shape
         self._masks_shape = rows.masks_shape
         self._shape = (n_views, *task.view.shape)
         self._records = task.render_mode is not None
 
+    def _bind(self) -> None:
+        """Gather what the kernel of a step takes; looking it up would take longer than the step."""
+        rows = self._rows
+        self._row = rows.state[0]
+        self._rules = (*rows.sizes, rows.reward, rows.kind, *rows.tables)
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy; the row must be a view of the copied state, not a copy of the view."""
         self.__dict__.update(state)
-        self._row = self._rows.state[0]
+        self._bind()
 
     def reset(self, problem: Problem | None, np_random: np.random.Generator) -> None:
         """Start an episode on ``problem``, or on one drawn with a single word of ``np_random``."""

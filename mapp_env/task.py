@@ -16,6 +16,7 @@ from mapp_env.dynamics import (
     BY_COORDINATES,
     MAX_TABLE_CELLS,
     N_ACTIONS,
+    NO_DISTANCES,
     Reward,
     cell_table,
     manhattan_table,
@@ -43,8 +44,6 @@ MAX_BYTES = 1 << 30
 
 Distances = tuple[NDArray[np.int32], int]
 """What the kernels take for ``distances``, shape (S, C), and ``first_field``."""
-
-NO_DISTANCES = np.zeros((1, 1), np.int32)
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,11 @@ class Task:
         return self._paths(fields) if self.observation == "geodesic" else (NO_DISTANCES, ALL_PAIRS)
 
     def _paths(self, fields: NDArray[np.int32]) -> Distances:
-        return (fields, 0) if self.needs_fields else (self.grid.distances, ALL_PAIRS)
+        if not self.needs_fields:
+            return self.grid.distances, ALL_PAIRS
+        seen = fields.view()
+        seen.flags.writeable = False
+        return seen, 0
 
     def check_memory(self, n_rows: int) -> None:
         """Refuse a number of rows whose arrays would not fit in memory.
