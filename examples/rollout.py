@@ -23,9 +23,9 @@ def spread_out(grid: mapp_env.Grid, state: np.ndarray, n_agents: int) -> list[in
     free = set(left)
     actions = []
     for cell in cells:
-        goal = min(free or left, key=lambda landmark: (grid.distances[cell, landmark], landmark))
-        free.discard(goal)
-        actions.append(int(np.argmin(grid.distances[grid.moves[cell], goal])))
+        chosen = min(free or left, key=lambda landmark: (grid.distances[cell, landmark], landmark))
+        free.discard(chosen)
+        actions.append(int(np.argmin(grid.distances[grid.moves[cell], chosen])))
     return actions
 
 

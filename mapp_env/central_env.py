@@ -12,9 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from numpy.typing import NDArray
 
+from mapp_env.display import Display
 from mapp_env.grid import Grid
 from mapp_env.observation import Observation
-from mapp_env.rendering.display import Display
 from mapp_env.simulation import Simulation
 from mapp_env.task import RENDER_MODES, Task, find_grid
 from mapp_env.validation import MAX_SEED, as_integer, check_choice, check_count, describe

@@ -2,19 +2,43 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
 
 __all__ = ["kernel"]
 
-# Compiled code is kept beside the source or, where that is read-only, in the user's cache folder.
-# Rules are small functions: without inlining, calls would take half of a batched step. (`Any`, as
-# numba's own types say nothing of what a decorated function takes and returns.) Kernels allocate
-# nothing, so they go without numba's reference counts: each slice of an array would cost two atomic
-# operations, together another half.
-#
-# Who edits a kernel that others call: numba notices a change of the file that a cached function
-# stands in, not of the files it calls into. Delete mapp_env/__pycache__ then; the tests use a cache
-# of their own for each state of the sources.
-kernel: Any = njit(cache=True, forceinline=True, _nrt=False)  # type: ignore[call-overload]
+
+def _digest_sources() -> str:
+    """Return a name for the present state of the package's sources."""
+    digest = hashlib.sha256()
+    folder = Path(__file__).parent
+    for path in sorted([*folder.glob("*.py"), *folder.glob("solvers/*.py")]):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+_SOURCES = _digest_sources()
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function at its first call, and keep the result for the next process.
+
+    Rules are small functions: without inlining, calls would take half of a batched step. Kernels
+    allocate nothing, so they go without numba's reference counts: each slice of an array would cost
+    two atomic operations, together another half. (The result is `Any`, as numba's types say nothing
+    of what a decorated function takes and returns.)
+
+    numba keeps compiled code in files named after the function, beside the source or, where that is
+    read-only, in the user's cache folder, and compiles anew when the file that the function stands
+    in has changed; but a kernel also holds the code of those it calls, in other files. Hence a name
+    that changes with any of them.
+    """
+    name = function.__qualname__
+    function.__qualname__ = f"{name}_{_SOURCES}"
+    compiled = njit(cache=True, forceinline=True, _nrt=False)(function)  # type: ignore[call-overload]
+    function.__qualname__ = name
+    return compiled

@@ -54,7 +54,14 @@ class Grid:
     depot: int = None  # type: ignore[assignment]
 
     def __init__(self, walls: ArrayLike, depot: object = None) -> None:
-        array = np.asarray(walls)
+        if not isinstance(walls, np.ndarray | list | tuple):
+            raise ValueError(
+                f"walls must be a two-dimensional array of bool, got {describe(walls)}"
+            )
+        try:
+            array = np.asarray(walls)
+        except ValueError:
+            array = np.array(None)  # ragged
         if array.ndim != 2 or array.dtype != np.bool_:
             raise ValueError(
                 "walls must be a two-dimensional array of bool, "
@@ -113,9 +120,13 @@ class Grid:
             If the file cannot be opened, is not a regular file, is too large or is malformed; the
             message names path and line.
         """
-        if not isinstance(path, str | os.PathLike):
-            raise ValueError(f"path must be a str or os.PathLike, got {describe(path)}")
-        return cls._from_parsed(read_map(path), depot, os.fspath(path))
+        try:
+            source = os.fspath(path)
+        except TypeError:
+            source = None
+        if not isinstance(source, str):
+            raise ValueError(f"path must be a str or os.PathLike of one, got {describe(path)}")
+        return cls._from_parsed(read_map(source), depot, source)
 
     @classmethod
     def _from_parsed(cls, parsed: ParsedMap, depot: object, source: str) -> Grid:
@@ -165,7 +176,9 @@ class Grid:
         index = as_integer(value)
         if index is not None and 0 <= index < self.n_cells:
             return index
-        if index is None and isinstance(value, tuple | list | np.ndarray) and len(value) == 2:
+        if isinstance(value, np.ndarray) and value.ndim == 1:
+            value = value.tolist()
+        if isinstance(value, tuple | list) and len(value) == 2:
             row, col = as_integer(value[0]), as_integer(value[1])
             on_grid = row in range(self.rows) and col in range(self.cols)
             if row is not None and col is not None and on_grid:
@@ -244,6 +257,8 @@ class Grid:
         ValueError
             If a cell is off the grid.
         """
+        if not isinstance(cells, Iterable):
+            raise ValueError(f"cells must be a sequence of cells, got {describe(cells)}")
         starts = np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
         fields = np.empty((len(starts), self.n_cells), dtype=np.int32)
         queue = np.empty(self.n_cells, dtype=np.int32)
@@ -255,7 +270,7 @@ class Grid:
                 fill_distances(self.moves, start, fields[index], queue)
         return fields
 
-    def path(self, start: int, goal: int) -> tuple[int, ...]:
+    def path(self, start: int, end: int) -> tuple[int, ...]:
         """Return a shortest path, both ends included; among equals the first in action order.
 
         Raises
@@ -263,12 +278,12 @@ class Grid:
         ValueError
             If a cell is off the grid or there is no path.
         """
-        cell, end = self.cell("start", start), self.cell("goal", goal)
-        steps = self.home if end == self.depot else self.distances_from([end])[0]
+        cell, last = self.cell("start", start), self.cell("end", end)
+        steps = self.home if last == self.depot else self.distances_from([last])[0]
         if steps[cell] == UNREACHABLE:
-            raise ValueError(f"there is no path from start {start} to goal {goal}")
+            raise ValueError(f"there is no path from start {start} to end {end}")
         path = [cell]
-        while cell != end:
+        while cell != last:
             cell = next(int(to) for to in self.moves[cell] if steps[to] == steps[cell] - 1)
             path.append(cell)
         return tuple(path)
@@ -282,6 +297,10 @@ class Grid:
 
     def __hash__(self) -> int:
         return hash((self.walls.shape, self.walls.tobytes(), self.depot))
+
+    def __reduce__(self) -> tuple[type[Grid], tuple[NDArray[np.bool_], int]]:
+        """Copy by building anew, as copies of read-only arrays would not be read-only."""
+        return Grid, (self.walls, self.depot)
 
     def __repr__(self) -> str:
         return (

@@ -9,8 +9,8 @@ same rows below a header of ``type``, ``height``, ``width`` and ``map`` lines, a
 from __future__ import annotations
 
 import os
+import re
 import stat
-import textwrap
 from typing import NamedTuple
 
 import numpy as np
@@ -43,13 +43,13 @@ class ParsedMap(NamedTuple):
     depot: int | None  # cell, if the text marks one
 
 
-def read_map(path: str | os.PathLike[str]) -> ParsedMap:
+def read_map(source: str) -> ParsedMap:
     """Read a map file.
 
     Parameters
     ----------
-    path : str or os.PathLike
-        A regular file of at most ``MAX_FILE_BYTES`` bytes.
+    source : str
+        Path of a regular file of at most ``MAX_FILE_BYTES`` bytes.
 
     Raises
     ------
@@ -57,7 +57,6 @@ def read_map(path: str | os.PathLike[str]) -> ParsedMap:
         If the file cannot be opened, is not a regular file, is too large or is malformed. Nothing
         is read before the file is known to be regular, so that a pipe or a device cannot block.
     """
-    source = os.fspath(path)
     try:
         # Non-blocking: opening a FIFO that nobody writes to would otherwise wait for ever.
         handle = os.open(source, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
@@ -101,7 +100,9 @@ def parse_map(text: str, source: str = "text") -> ParsedMap:
     """
     if len(text) > MAX_FILE_BYTES:
         raise MapError(f"{source}: has {len(text)} characters, a map may have {MAX_FILE_BYTES}")
-    lines = [line.rstrip() for line in textwrap.dedent(text).splitlines()]
+    lines = [line.rstrip(" \t") for line in re.split(r"\r\n|\r|\n", text)]
+    indents = [len(line) - len(line.lstrip(" ")) for line in lines if line]
+    lines = [line[min(indents) :] if line else line for line in lines]
     first = 0
     while first < len(lines) and not lines[first]:
         first += 1
@@ -129,7 +130,8 @@ def _read_header(lines: list[str], first: int, source: str) -> tuple[int, int, i
                 raise MapError(f"{source}:{index + 1}: header lacks {missing[0]!r}")
             sides = []
             for key in ("height", "width"):
-                number = int(values[key]) if values[key].isdecimal() else 0
+                digits = values[key]
+                number = int(digits) if digits.isdecimal() and len(digits) < 10 else 0
                 if not 1 <= number <= MAX_SIDE:
                     raise MapError(
                         f"{source}:{index + 1}: {key} must be in 1..{MAX_SIDE}, "

@@ -12,7 +12,8 @@ from __future__ import annotations
 from typing import Any
 
 from pettingzoo import AECEnv
-from pettingzoo.utils.conversions import parallel_to_aec, parallel_to_aec_wrapper
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from mapp_env.parallel_env import MappParallelEnv
 
@@ -21,14 +22,31 @@ __all__ = ["env", "parallel_env", "raw_env"]
 parallel_env = MappParallelEnv
 
 
+class MappAECEnv(parallel_to_aec_wrapper):
+    """The AEC form, in which a bad action is refused when it is given, not when all agents move."""
+
+    def step(self, action: int | None) -> None:
+        """Give the selected agent's action; all agents move with the last one's.
+
+        Raises
+        ------
+        ValueError
+            If it is not an action; the agent stays selected.
+        """
+        agent = self.agent_selection
+        if not (self.terminations[agent] or self.truncations[agent]):
+            self.env.check_action(agent, action)
+        super().step(action)
+
+
 def env(**arguments: Any) -> AECEnv[str, Any, Any]:
     """Return the environment in PettingZoo's AEC form, which refuses calls in the wrong order.
 
     Parameters are those of :class:`mapp_env.parallel_env.MappParallelEnv`.
     """
-    return parallel_to_aec(parallel_env(**arguments))
+    return OrderEnforcingWrapper(MappAECEnv(parallel_env(**arguments)))
 
 
 def raw_env(**arguments: Any) -> AECEnv[str, Any, Any]:
     """Return the AEC form without the order check."""
-    return parallel_to_aec_wrapper(parallel_env(**arguments))
+    return MappAECEnv(parallel_env(**arguments))

@@ -14,9 +14,9 @@ from gymnasium.spaces import Box, Discrete
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from mapp_env.display import Display
 from mapp_env.grid import Grid
 from mapp_env.problem import MAX_CYCLES
-from mapp_env.rendering.display import Display
 from mapp_env.simulation import Simulation
 from mapp_env.task import RENDER_MODES, Task, find_grid
 from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
@@ -31,8 +31,8 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     """Multi-agent path planning on a walled grid: visit every landmark together, in few steps.
 
     Agents start on the depot and move at the same instant; a landmark is visited for good when an
-    agent steps on it; when all are, the episode ends. The rules are DESIGN's R1 to R9, in the docs
-    under "rules", after Çetinkaya, arXiv 2110.01460, sections 3 and 5.
+    agent steps on it; when all are, the episode ends. The rules R1 to R9 stand in docs/env.md,
+    after Çetinkaya, arXiv 2110.01460, sections 3 and 5.
 
     Parameters
     ----------
@@ -103,6 +103,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         self._actions = np.zeros(task.n_agents, np.int64)
         self._simulation = Simulation(task, task.n_agents)
         self._np_random: np.random.Generator | None = None
+        self._started = False
         self._display = Display(task.render_mode, self.metadata["render_fps"])
 
     # -- what agents have --------------------------------------------------------------
@@ -127,6 +128,13 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     def state(self) -> NDArray[np.float32]:
         """Return the global observation (R9), shape (N + 2K,) float32, whatever agents see."""
         return self._simulation.state()
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """The generator that problems are drawn from, as Gymnasium environments have it."""
+        if self._np_random is None:
+            self._np_random, _ = seeding.np_random()
+        return self._np_random
 
     # -- episodes ----------------------------------------------------------------------
 
@@ -158,9 +166,10 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         if seed is not None:
             seed = check_count("seed", seed, 0, MAX_SEED)
         problem = self.task.check_options(options)
-        if seed is not None or self._np_random is None:
+        if seed is not None:
             self._np_random, _ = seeding.np_random(seed)
-        self._simulation.reset(problem, self._np_random)
+        self._simulation.reset(problem, self.np_random)
+        self._started = True
         self.agents = list(self._names)
         observations, infos = self._by_agent(*self._simulation.observe())
         if self.render_mode == "human":
@@ -199,7 +208,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         """
         simulation = self._simulation
         if not simulation.running:
-            if not actions and not self.agents and self._np_random is not None:
+            if not actions and self._started:
                 return {}, {}, {}, {}, {}
             raise ResetNeeded("step() needs an episode in progress: call reset() first")
         self._read_actions(actions)
@@ -243,14 +252,25 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
                 action = actions[name]
             except KeyError:
                 self._refuse_agents(actions)
-            if type(action) is not int:
-                action = as_integer(action)  # type: ignore[assignment]
-            if action is None or not 0 <= action < n_actions:
-                raise ValueError(
-                    f"actions[{name!r}] must be an integer in 0..{n_actions - 1}, "
-                    f"got {describe(actions[name])}"
-                )
+            if type(action) is not int or not 0 <= action < n_actions:
+                action = self.check_action(name, action)
             row[index] = action
+
+    def check_action(self, agent: AgentID, action: object) -> int:
+        """Return an agent's action as an ``int``.
+
+        Raises
+        ------
+        ValueError
+            If it is not one of the agent's actions.
+        """
+        number = as_integer(action)
+        if number is None or not 0 <= number < self._n_actions:
+            raise ValueError(
+                f"actions[{agent!r}] must be an integer in 0..{self._n_actions - 1}, "
+                f"got {describe(action)}"
+            )
+        return number
 
     def _refuse_agents(self, actions: Mapping[AgentID, int]) -> None:
         missing = [name for name in self._names if name not in actions]
@@ -275,7 +295,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         gymnasium.error.ResetNeeded
             Before the first reset.
         """
-        if self._np_random is None:
+        if not self._started:
             raise ResetNeeded("render() needs an episode: call reset() first")
         if self.render_mode is None:
             logger.warn("render() shows nothing: make the environment with a render_mode")

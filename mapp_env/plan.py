@@ -143,9 +143,9 @@ def _check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]
     """Return joint actions as an int64 array of shape (T, N)."""
     try:
         array = np.asarray(joint_actions)
-    except ValueError:
-        array = np.empty(0)  # ragged
-    if array.size == 0 and array.ndim <= 2 and len(array) == 0:
+    except (ValueError, RecursionError):
+        array = np.array(None)  # ragged, or nested too deep
+    if array.shape in ((0,), (0, n_agents)):
         return np.empty((0, n_agents), np.int64)
     if array.ndim != 2 or array.shape[1] != n_agents or array.dtype.kind not in "iu":
         raise ValueError(

@@ -28,6 +28,8 @@ MAX_AGENTS = 16
 MAX_LANDMARKS = 64
 MAX_CYCLES = 1_000_000
 
+MAX_LISTED = 1_000_000  # problems of a grid that are listed to draw from; beyond, by rejection
+
 LOW_32_BITS = 0xFFFFFFFF
 
 
@@ -164,7 +166,12 @@ def sample_problems(
     check_count("n_landmarks", n_landmarks, 1, MAX_LANDMARKS)
     check_count("n_problems", n_problems, 1, 10_000_000)
     check_count("seed", seed, 0, 2**63 - 1)
-    seen = {tuple(sorted(int(cell) for cell in landmarks)) for landmarks in exclude}
+    if not isinstance(exclude, Iterable):
+        raise ValueError(f"exclude must be a sequence of landmark sets, got {describe(exclude)}")
+    seen = {
+        tuple(sorted(check_landmarks(grid, landmarks, n_landmarks, f"exclude[{index}]")))
+        for index, landmarks in enumerate(exclude)
+    }
     total = math.comb(grid.reachable.size, n_landmarks)
     if n_problems > total - len(seen):
         raise ValueError(
@@ -172,7 +179,7 @@ def sample_problems(
             f"{n_landmarks} landmarks on this grid that are not excluded; got {n_problems}"
         )
     rng = np.random.default_rng(seed)
-    if total <= 4 * (n_problems + len(seen)):
+    if total <= MAX_LISTED and total <= 4 * (n_problems + len(seen)):
         # So few problems that drawing until enough distinct ones turn up could take long.
         every = combinations(grid.reachable.tolist(), n_landmarks)
         left = np.array([landmarks for landmarks in every if landmarks not in seen], np.int32)

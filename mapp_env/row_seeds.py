@@ -51,7 +51,9 @@ class RowSeeds:
             return None
         if as_integer(seed) is not None:
             return check_count("seed", seed, 0, MAX_SEED)
-        if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
+        if isinstance(seed, np.ndarray) and seed.ndim == 1:
+            seed = list(seed)
+        if not isinstance(seed, Sequence) or isinstance(seed, str | bytes):
             raise ValueError(
                 f"seed must be an integer, a sequence of {self.n_rows} or None, "
                 f"got {describe(seed)}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from mapp_env.dynamics import measure_row, reset_row, row_length, step_row
 from mapp_env.grid import fill_distances
 from mapp_env.observation import observe_row
 from mapp_env.problem import draw_landmarks
-from mapp_env.rendering.scene import Scene
+from mapp_env.scene import TRAIL_MOVES, Scene
 from mapp_env.task import Task
 
 __all__ = ["Rows", "find_bad_action", "step_and_observe"]
@@ -55,9 +56,9 @@ class Rows:
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
         # Pictures show where agents have been: their cells at each step, for each row.
-        self._trails: list[list[tuple[int, ...]]] | None = None
+        self._trails: list[deque[tuple[int, ...]]] | None = None
         if task.render_mode is not None:
-            self._trails = [[] for _ in range(n_rows)]
+            self._trails = [deque(maxlen=TRAIL_MOVES + 1) for _ in range(n_rows)]
 
     def _find_tables(self) -> tuple[Any, ...]:
         """Return the table and the distances of reward and views that the kernels read."""
@@ -109,7 +110,7 @@ class Rows:
         self.limits[indices] = task.max_cycles if limit is None else limit
         if self._trails is not None:
             for index in indices:
-                self._trails[index] = []
+                self._trails[index].clear()
             self.extend_trails(indices)
 
     def step(
@@ -374,7 +375,10 @@ def _measure_rows(
     costs: NDArray[np.float64],
 ) -> None:
     for place, index in enumerate(indices):
-        costs[place] = measure_row(rows[index], n_agents, n_landmarks, table)
+        cover_time, makespan, distance = measure_row(rows[index], n_agents, n_landmarks, table)
+        costs[place, 0] = cover_time
+        costs[place, 1] = makespan
+        costs[place, 2] = distance
 
 
 @kernel

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.problem import Problem
-from mapp_env.rendering.scene import Scene
 from mapp_env.rows import Rows, step_and_observe
+from mapp_env.scene import Scene
 from mapp_env.task import Task
 
 __all__ = ["Simulation", "metrics_of"]

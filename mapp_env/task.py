@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -105,6 +105,15 @@ class Task:
             )
         self.check_memory(1)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy the arguments alone: copies of the read-only tables would not be read-only."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy."""
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
+
     # -- what follows from the arguments -----------------------------------------------
 
     @property
@@ -157,22 +166,22 @@ class Task:
         wanted = "geodesic" in (self.reward, self.observation)
         return wanted and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
 
-    def reward_distances(self, fields: NDArray[np.int32]) -> Distances:
+    def reward_distances(self, lines: NDArray[np.int32]) -> Distances:
         """Return the distances that the reward looks up."""
         if self.reward == "geodesic":
-            return self._paths(fields)
+            return self._paths(lines)
         if self.grid.n_cells <= MAX_TABLE_CELLS:
             return manhattan_table(self.grid), ALL_PAIRS
         return NO_DISTANCES, BY_COORDINATES
 
-    def view_distances(self, fields: NDArray[np.int32]) -> Distances:
+    def view_distances(self, lines: NDArray[np.int32]) -> Distances:
         """Return the distances that the observation looks up."""
-        return self._paths(fields) if self.observation == "geodesic" else (NO_DISTANCES, ALL_PAIRS)
+        return self._paths(lines) if self.observation == "geodesic" else (NO_DISTANCES, ALL_PAIRS)
 
-    def _paths(self, fields: NDArray[np.int32]) -> Distances:
+    def _paths(self, lines: NDArray[np.int32]) -> Distances:
         if not self.needs_fields:
             return self.grid.distances, ALL_PAIRS
-        seen = fields.view()
+        seen = lines.view()
         seen.flags.writeable = False
         return seen, 0
 
@@ -257,5 +266,5 @@ def find_grid(grid: object) -> Grid:
         return Grid.load(grid)
     raise ValueError(
         f"grid must be a mapp_env.Grid, a bundled name ({', '.join(grid_names())}) or a path to a "
-        f"map file; got {describe(grid)}"
+        f"map file; got {describe(grid, 320)}"
     )

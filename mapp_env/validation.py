@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import reprlib
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -12,12 +13,22 @@ __all__ = ["MAX_SEED", "as_integer", "check_choice", "check_count", "check_flag"
 
 MAX_SEED = 2**128 - 1
 
+# Looks at the first few items alone: a refusal should not take as long as printing a whole list.
+_SHORT = reprlib.Repr()
+_SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 8
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 300
 
-def describe(value: object, limit: int = 80) -> str:
+
+def describe(value: object, limit: int = 100) -> str:
     """Return ``repr(value)``, cut so that a message stays readable whatever was passed."""
     if isinstance(value, np.ndarray) and value.size > 16:
         return f"array of shape {value.shape} and dtype {value.dtype}"
-    text = repr(value)
+    try:
+        text = _SHORT.repr(value)
+    except (
+        Exception
+    ):  # a broken or hostile __repr__, or a number with more digits than Python prints
+        text = f"a {type(value).__name__}"
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
 
 

@@ -10,19 +10,32 @@ import numpy as np
 from gymnasium import logger
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from mapp_env.central_env import CentralEnv, central_action_space
+from mapp_env.display import Display
 from mapp_env.grid import Grid
 from mapp_env.observation import Observation
 from mapp_env.problem import check_landmarks
-from mapp_env.rendering.display import Display
 from mapp_env.row_seeds import RowSeeds
 from mapp_env.rows import Rows, find_bad_action
 from mapp_env.task import Task, find_grid
 from mapp_env.validation import check_choice, check_count, describe
+
+try:
+    from gymnasium.vector import AutoresetMode
+except ImportError:  # Gymnasium 1.0 has the next-step mode alone, and no name for it
+    from enum import Enum
+
+    class AutoresetMode(Enum):  # type: ignore[no-redef]
+        """The modes of Gymnasium 1.1 and later."""
+
+        NEXT_STEP = "NextStep"
+        SAME_STEP = "SameStep"
+        DISABLED = "Disabled"
+
 
 __all__ = ["MAX_ENVS", "MappVectorEnv", "make_vec"]
 
@@ -313,8 +326,13 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """Return the landmarks that ``options`` ask for, shape (B, K), and the step limit."""
         landmarks = None if options is None else options.get("landmarks")
         if isinstance(landmarks, np.ndarray) and landmarks.ndim == 2:
-            shape = (self.num_envs, self.task.n_landmarks)
-            if landmarks.shape == shape:
+            n_landmarks = self.task.n_landmarks
+            if landmarks.shape == (self.num_envs, n_landmarks):
+                if landmarks.shape == (n_landmarks, 2):
+                    raise ValueError(
+                        "options['landmarks'] of shape (2, 2) may mean a cell for each of 2 rows "
+                        "or (row, col) pairs: pass pairs as a list, or reset row by row"
+                    )
                 return self._check_landmarks(landmarks), None
         problem = self.task.check_options(options)
         if problem is None:

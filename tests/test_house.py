@@ -21,10 +21,11 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("map_format",),
     ("grid",),
     ("grids",),
-    ("problem",),
+    ("problem", "scene"),
     ("dynamics", "observation", "plan", "solvers", "rendering", "task"),
-    ("rows", "row_seeds"),
-    ("simulation", "parallel_env", "central_env", "vector_env"),
+    ("rows", "row_seeds", "display"),
+    ("simulation",),
+    ("parallel_env", "central_env", "vector_env"),
     ("mapp_v0",),
     ("__init__",),
 )
@@ -46,7 +47,7 @@ def layer(module: str) -> int:
     for level, names in enumerate(LAYERS):
         if top in names:
             return level
-    raise AssertionError(f"{module} has no place in the house: see DESIGN, section 5")
+    raise AssertionError(f"{module} has no place in LAYERS: give it one")
 
 
 @functools.cache

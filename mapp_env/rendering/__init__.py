@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 # files load Pillow only when they draw.
 from mapp_env.rendering.ansi import ansi
 from mapp_env.rendering.rgb_array import rgb_array
-from mapp_env.rendering.scene import Scene
+from mapp_env.scene import Scene
 
 if TYPE_CHECKING:
     from mapp_env.rendering.figures import draw_plan

@@ -27,7 +27,7 @@ from mapp_env.rendering.palette import (
     agent_colour,
     blend,
 )
-from mapp_env.rendering.scene import Scene
+from mapp_env.scene import TRAIL_MOVES, Scene
 
 if TYPE_CHECKING:
     from mapp_env.grid import Grid
@@ -48,7 +48,6 @@ DETAILED_CELL = 12  # from here on cells are outlined and tinted
 SMALL_ICON = 21
 SMALL_DISC = 17
 MIN_DISC = 9
-TRAIL_MOVES = 512  # older moves are not drawn, so that the time per frame is bounded
 
 Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
 _Place: TypeAlias = tuple[float, float, int]  # an agent's middle, down and right, and its diameter

@@ -1,4 +1,4 @@
-"""Shows scenes in one render mode; the drawing code is imported when the first is shown."""
+"""Shows scenes in one render mode; `rendering` is imported when the first is shown."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.rendering.scene import Scene
+from mapp_env.scene import Scene
 
 if TYPE_CHECKING:
     from mapp_env.rendering.human import Window
