@@ -13,6 +13,7 @@ counted with the step limit.
 
 import csv
 import io
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,15 +25,17 @@ import tyro
 
 from baselines.checks import check_count, check_number
 from baselines.guidance import Acting, Guidance, GuidedPolicy
+from baselines.networks import NetworkSpec
 from baselines.policy import NearestLandmarkPolicy, RandomPolicy, load_policy
-from baselines.runs import read_config, write_atomically
-from mapp_env import Grid, grid_names, make_grid, make_vec, sample_problems
+from baselines.runs import CONFIG_FILE, read_config, write_atomically
+from mapp_env import Grid, Problem, grid_names, make_grid, make_vec, sample_problems
 
 # Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
 # from streams spawned from their own seeds; those that coincide are left out one by one.
 EVALUATION_SEED = 0
 BATCH = 4096  # problems played at a time
 N_ACTIONS = 4
+N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class Evaluation:
     cover_time: np.ndarray  # (P,) float64
     makespan: np.ndarray  # (P,) float64, the way home included (R8)
     total_distance: np.ndarray  # (P,) float64, the way home included (R8)
-    actions: np.ndarray | None  # (T, P, N) int64 when asked for; problem p took steps[p] of them
+    actions: np.ndarray  # (T, kept, N) int8, of the first problems; p took steps[p] of them
 
     def summary(self) -> dict[str, float]:
         """Means over the problems, in the order of the table's columns; NaN if none is solved."""
@@ -75,7 +78,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: Acting, setting: Setting, landmarks: np.ndarray, keep_actions: bool = False
+    policy: Acting, setting: Setting, landmarks: np.ndarray, n_kept: int = 0
 ) -> Evaluation:
     """Let a policy play each problem once.
 
@@ -87,14 +90,15 @@ def evaluate(
         Grid, number of agents and landmarks, step limit.
     landmarks
         (P, K) landmark cells, a problem per row.
-    keep_actions
-        Whether the joint actions are kept, to be replayed or drawn.
+    n_kept
+        Of how many problems, the first ones, the joint actions are kept, to be replayed or drawn.
 
     Raises
     ------
     ValueError
         If there is no problem, or one is not a problem of the grid.
     """
+    check_count("n_kept", n_kept, 0, 1_000_000)
     landmarks = np.asarray(landmarks)
     if landmarks.ndim != 2 or landmarks.shape[0] == 0 or landmarks.shape[1] != setting.n_landmarks:
         raise ValueError(
@@ -102,6 +106,7 @@ def evaluate(
             f"shape {landmarks.shape}"
         )
     n_problems = len(landmarks)
+    n_kept = min(n_kept, n_problems)
     batch = min(BATCH, n_problems)
     envs = make_vec(
         batch,
@@ -116,9 +121,7 @@ def evaluate(
     }
     success = np.zeros(n_problems, np.bool_)
     steps = np.zeros(n_problems, np.int64)
-    kept = np.zeros(
-        (setting.max_cycles if keep_actions else 0, n_problems, setting.n_agents), np.int64
-    )
+    kept = np.zeros((setting.max_cycles, n_kept, setting.n_agents), np.int8)
     for start in range(0, n_problems, batch):
         # The last batch is filled up with problems played before; they are not read again.
         rows = np.minimum(np.arange(start, start + batch), n_problems - 1)
@@ -127,8 +130,9 @@ def evaluate(
         step = 0
         while playing.any():
             actions = policy.act(observations)
-            if keep_actions:
-                kept[step, rows[playing]] = actions[playing]
+            if start < n_kept:
+                drawn = playing & (rows < n_kept)
+                kept[step, rows[drawn]] = actions[drawn]
             observations, _, terminated, truncated, infos = envs.step(actions)
             step += 1
             ended = playing & (terminated | truncated)
@@ -145,7 +149,7 @@ def evaluate(
         success=success,
         steps=steps,
         **costs,
-        actions=kept if keep_actions else None,
+        actions=kept,
     )
 
 
@@ -159,6 +163,12 @@ def unseen_problems(
     return sample_problems(
         setting.grid, n_problems, n_landmarks=setting.n_landmarks, seed=seed, exclude=seen
     )
+
+
+def count_unseen(setting: Setting, seen: Sequence[Sequence[int]]) -> int:
+    """Return how many problems of the setting there are besides those in `seen`."""
+    every = math.comb(setting.grid.reachable.size, setting.n_landmarks)
+    return every - len({tuple(sorted(landmarks)) for landmarks in seen})
 
 
 def format_table(evaluations: dict[str, Evaluation]) -> str:
@@ -240,33 +250,75 @@ def find_grid(name: str) -> Grid:
     return make_grid(name) if name in grid_names() else Grid.load(name)
 
 
-def read_setting(folder: Path) -> tuple[Setting, list[list[int]]]:
+def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
     """Read from a run folder what was trained: the setting, and the training problems.
 
     Raises
     ------
     ValueError
-        If the run's config does not say it.
+        If the run's config does not say it, or says what cannot be.
     """
     config = read_config(folder)
+    where = f"{folder / CONFIG_FILE}"
     try:
-        options = config["options"]
+        options, rows = config["options"], config["training_problems"]
+        if not isinstance(options, dict) or not isinstance(rows, list):
+            raise ValueError("options must be an object, training_problems a list")
         setting = Setting(
             Grid.from_text(config["grid"]),
-            int(options["n_agents"]),
-            int(options["n_landmarks"]),
-            int(options["max_cycles"]),
+            options["n_agents"],
+            options["n_landmarks"],
+            options["max_cycles"],
         )
-        return setting, [[int(cell) for cell in row] for row in config["training_problems"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{folder}: its config does not tell the setting: {error!r}") from error
+        check_count("n_agents", setting.n_agents, 1, 16)
+        check_count("n_landmarks", setting.n_landmarks, 1, 64)
+        check_count("max_cycles", setting.max_cycles, 1, 1_000_000)
+    except KeyError as error:
+        raise ValueError(f"{where}: no entry {error}") from error
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}") from error
+    problems = []
+    for index, landmarks in enumerate(rows):
+        try:
+            cells = Problem(setting.grid, landmarks).landmarks
+        except ValueError as error:
+            raise ValueError(f"{where}: training_problems[{index}]: {error}") from error
+        if len(cells) != setting.n_landmarks:
+            raise ValueError(
+                f"{where}: training_problems[{index}]: must have {setting.n_landmarks} landmarks, "
+                f"got {len(cells)}"
+            )
+        problems.append(cells)
+    return setting, problems
+
+
+def check_fits(spec: NetworkSpec, setting: Setting, folder: Path) -> None:
+    """Refuse a run whose config and weights tell of different tasks.
+
+    Raises
+    ------
+    ValueError
+        If grid size, number of agents, landmarks or actions differ.
+    """
+    told = {
+        "n_cells": setting.grid.n_cells,
+        "n_agents": setting.n_agents,
+        "n_landmarks": setting.n_landmarks,
+        "n_actions": N_ACTIONS,
+    }
+    for name, value in told.items():
+        if getattr(spec, name) != value:
+            raise ValueError(
+                f"{folder}: {name} is {value} by {CONFIG_FILE}, and {getattr(spec, name)} by the "
+                "weights"
+            )
 
 
 def main(args: Args) -> None:
     """Evaluate one policy and print the table."""
     torch.set_num_threads(args.threads)
     rng_policy, rng_guidance = np.random.default_rng(args.seed).spawn(2)
-    seen: list[list[int]] = []
+    seen: list[tuple[int, ...]] = []
     policy: Acting
     if args.policy in ("random", "nearest"):
         setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
@@ -275,9 +327,11 @@ def main(args: Args) -> None:
         else:
             policy = NearestLandmarkPolicy(setting.grid, setting.n_agents, setting.n_landmarks)
     else:
-        policy = load_policy(args.policy)
+        policy = trained = load_policy(args.policy)
         folder = Path(args.policy)
-        setting, seen = read_setting(folder if folder.is_dir() else folder.parent)
+        folder = folder if folder.is_dir() else folder.parent
+        setting, seen = read_setting(folder)
+        check_fits(trained.spec, setting, folder)
     label = args.policy
     if args.guidance > 0:
         guidance = Guidance(
@@ -285,7 +339,12 @@ def main(args: Args) -> None:
         )
         policy = GuidedPolicy(policy, guidance, args.guidance, rng_guidance)
         label += f" + guidance {args.guidance:g}"
-    problems = unseen_problems(setting, args.problems, seen, args.seed)
+    n_problems = count_unseen(setting, seen)
+    if n_problems < 1:
+        raise ValueError("problems: there is none that the run was not trained on")
+    if n_problems < args.problems:
+        print(f"only {n_problems:,} of {args.problems:,} problems: there are no more unseen ones\n")
+    problems = unseen_problems(setting, min(args.problems, n_problems), seen, args.seed)
     print(format_table({label: evaluate(policy, setting, problems)}))
 
 

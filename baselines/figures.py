@@ -21,13 +21,15 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from baselines.evaluate import Evaluation
-from baselines.runs import read_metrics
+from baselines.checks import check_count
+from baselines.evaluate import N_ROUTES, Evaluation
+from baselines.runs import METRICS_FILE, read_metrics
 from mapp_env import Problem, replay
 from mapp_env.rendering import draw_plan
 
 DPI = 120
-PANEL_WIDTH, PANEL_HEIGHT = 5.8, 6.0  # inches, title and legend of a map of routes included
+PANEL_WIDTH, PANEL_HEIGHT = 6.2, 6.0  # inches, title and legend of a map of routes included
+DRAWN_COLUMNS = ("episode", "problem", "steps", "reward")
 EPISODE_COLOUR = "#9db8d2"
 MEAN_COLOUR = "#123a63"
 
@@ -38,10 +40,15 @@ def draw_learning_curves(folder: Path, window: int = 30) -> list[Path]:
     Raises
     ------
     ValueError
-        If metrics.csv cannot be read or has no finished episode.
+        If the window is none, or metrics.csv cannot be read, lacks a column that is drawn, or has
+        no finished episode.
     """
+    check_count("window", window, 1, 1_000_000_000)
     metrics = read_metrics(folder)
-    if not metrics.get("episode"):
+    missing = [name for name in DRAWN_COLUMNS if name not in metrics]
+    if missing:
+        raise ValueError(f"{folder / METRICS_FILE}: no column {', '.join(missing)}")
+    if not metrics["episode"]:
         raise ValueError(f"{folder}: no finished episode to draw")
     panels = (
         ("fig2_reward.png", "reward", "Reward of the episode", "Fig. 2: reward per episode"),
@@ -84,10 +91,16 @@ def _draw_curve(
 def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
     """Draw Fig. 4: the routes of each evaluation's first two problems, a row per policy.
 
-    The evaluations must have kept their actions. Nothing is chosen by how it came out: the
+    The evaluations must have kept the actions of these. Nothing is chosen by how it came out: the
     problems are the first two of the evaluation, solved or not.
     """
-    n_columns = min(2, *(len(e.landmarks) for e in evaluations.values()))
+    n_columns = min(N_ROUTES, *(len(e.landmarks) for e in evaluations.values()))
+    for label, evaluation in evaluations.items():
+        if evaluation.actions.shape[1] < n_columns:
+            raise ValueError(
+                f"evaluations must have kept the actions of {n_columns} problems, {label!r} has "
+                f"those of {evaluation.actions.shape[1]}"
+            )
     figure, grid_of_axes = plt.subplots(
         len(evaluations),
         n_columns,
@@ -104,8 +117,6 @@ def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
         hspace=1.35 / (PANEL_HEIGHT - 1.35),
     )
     for row, (label, evaluation) in zip(grid_of_axes, evaluations.items(), strict=True):
-        if evaluation.actions is None:
-            raise ValueError(f"evaluations must have kept their actions, {label!r} has not")
         for index, axes in enumerate(row):
             problem = Problem(
                 evaluation.setting.grid,

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from baselines.checks import check_count, check_number
+from baselines.checks import check_count, check_number, check_observations
 from mapp_env import Grid
 
 NO_DIRECTION = -1
@@ -89,9 +89,19 @@ class GuidedPolicy:
         self.policy, self.guidance, self.influence, self.rng = policy, guidance, influence, rng
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Return joint actions (B, N): the policy's, or the guidance's where an agent obeys it."""
-        actions = self.policy.act(observations)
-        return self.guidance.apply(actions, observations, self.influence, self.rng)
+        """Return joint actions (B, N): the policy's, or the guidance's where an agent obeys it.
+
+        Raises
+        ------
+        ValueError
+            If the observations have another shape or hold numbers that are no cells or flags.
+        """
+        guidance = self.guidance
+        checked = check_observations(
+            observations, guidance.n_agents, guidance.n_landmarks, len(guidance.rays)
+        )
+        actions = self.policy.act(checked)
+        return guidance.apply(actions, checked, self.influence, self.rng)
 
 
 def sight_rays(grid: Grid, reach: int) -> np.ndarray:

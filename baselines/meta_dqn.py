@@ -32,8 +32,10 @@ from baselines.checks import check_choice, check_count, check_number
 from baselines.evaluate import (
     EVALUATION_SEED,
     N_ACTIONS,
+    N_ROUTES,
     Evaluation,
     Setting,
+    count_unseen,
     evaluate,
     find_grid,
     format_table,
@@ -42,7 +44,13 @@ from baselines.evaluate import (
 )
 from baselines.guidance import Acting, Guidance, GuidedPolicy, LinearSchedule
 from baselines.networks import NetworkSpec, PaperNetwork, build_network, torch_generator
-from baselines.policy import NearestLandmarkPolicy, NetworkPolicy, RandomPolicy, save_policy
+from baselines.policy import (
+    MAX_TABLE_CELLS,
+    NearestLandmarkPolicy,
+    NetworkPolicy,
+    RandomPolicy,
+    save_policy,
+)
 from baselines.replay_memory import Batch, ReplayMemory
 from baselines.runs import (
     TIMING_FILE,
@@ -122,7 +130,8 @@ class Args:
     """how many moves away, straight and with no wall between, a landmark is still close"""
 
     evaluation_problems: int = 1000
-    """unseen problems for the table at the end; 0 leaves out the table and the routes"""
+    """unseen problems for the table at the end, or all there are if they are fewer; 0 leaves out
+    the table and the routes"""
     threads: int = 1
     """threads of PyTorch"""
 
@@ -283,6 +292,7 @@ def train(
     network = make_network(args, grid, torch_generator(streams.network))
     target = make_network(args, grid, torch.Generator())
     target.load_state_dict(network.state_dict())
+    # The fused step on a CPU is what needs torch 2.4.
     optimiser = torch.optim.Adam(network.parameters(), lr=args.learning_rate, fused=True)
     memory = ReplayMemory(args.memory_size, network.spec.observation_size, args.n_agents)
 
@@ -395,9 +405,12 @@ def evaluate_training(
     policies["network, guidance 1"] = guided(network, 1.0)
     policies["random"] = chance
     policies["random, guidance 1"] = guided(chance, 1.0)
-    policies["nearest landmark"] = NearestLandmarkPolicy(grid, args.n_agents, args.n_landmarks)
+    if grid.n_cells <= MAX_TABLE_CELLS:
+        policies["nearest landmark"] = NearestLandmarkPolicy(grid, args.n_agents, args.n_landmarks)
+    else:
+        print(f"no row for the nearest landmark: the grid has more than {MAX_TABLE_CELLS:,} cells")
     return {
-        label: evaluate(policy, setting, problems, keep_actions=True)
+        label: evaluate(policy, setting, problems, n_kept=N_ROUTES)
         for label, policy in policies.items()
     }
 
@@ -413,9 +426,9 @@ def main(args: Args) -> int:
         n_landmarks=args.n_landmarks,
         seed=int(Streams.spawn(args.seed).problems.generate_state(1)[0]),
     )
-    unseen = None
-    if args.evaluation_problems:
-        unseen = unseen_problems(setting, args.evaluation_problems, problems.tolist())
+    seen = problems.tolist()
+    n_evaluated = min(args.evaluation_problems, count_unseen(setting, seen))
+    unseen = unseen_problems(setting, n_evaluated, seen) if n_evaluated else None
 
     folder = args.out or default_folder(ALGORITHM, args.preset, args.seed)
     run = RunFolder(folder, METRICS)
@@ -424,9 +437,14 @@ def main(args: Args) -> int:
             "algorithm": ALGORITHM,
             "options": {**asdict(args), "out": str(folder)},
             "grid": setting.grid.to_text(),
-            "training_problems": problems.tolist(),
+            "training_problems": seen,
         }
     )
+    if n_evaluated < args.evaluation_problems:
+        print(
+            f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there are no "
+            "more unseen ones"
+        )
     signals = StopSignals()
     try:
         with signals:

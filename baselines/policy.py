@@ -5,6 +5,8 @@ joint actions (B, N).
 """
 
 import json
+import os
+import reprlib
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,17 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from baselines.checks import check_count
+from baselines.checks import check_count, check_observations, check_rows
 from baselines.networks import NetworkSpec, PaperNetwork, build_network
 from baselines.runs import WEIGHTS_FILE, read_bytes, write_atomically
 from mapp_env import Grid
 
 WEIGHTS_KEY = "mapp_env_policy"  # the one metadata entry of our safetensors files
 WEIGHTS_VERSION = 1
-MAX_WEIGHTS_BYTES = 64 * 1024 * 1024
+# The largest network that NetworkSpec allows takes 68 MiB.
+MAX_WEIGHTS_BYTES = 72 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024
+MAX_TABLE_CELLS = 4096  # the most cells for which a Grid keeps the distances of all pairs
 
 
 class NetworkPolicy:
@@ -41,7 +45,8 @@ class NetworkPolicy:
         ValueError
             If the observations have another shape or hold numbers that are no cells or flags.
         """
-        checked = check_observations(observations, self.spec)
+        spec = self.spec
+        checked = check_observations(observations, spec.n_agents, spec.n_landmarks, spec.n_cells)
         with torch.inference_mode():
             scores = self.network(torch.from_numpy(checked))
             actions: np.ndarray = scores.argmax(dim=-1).numpy()
@@ -55,8 +60,15 @@ class RandomPolicy:
         self.n_agents, self.n_actions, self.rng = n_agents, n_actions, rng
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Return joint actions (B, N), whatever is seen."""
-        return self.rng.integers(self.n_actions, size=(len(observations), self.n_agents))
+        """Return joint actions (B, N), whatever is seen.
+
+        Raises
+        ------
+        ValueError
+            If the observations are not rows of numbers.
+        """
+        n_rows = len(check_rows(observations))
+        return self.rng.integers(self.n_actions, size=(n_rows, self.n_agents))
 
 
 class NearestLandmarkPolicy:
@@ -68,7 +80,7 @@ class NearestLandmarkPolicy:
 
     def __init__(self, grid: Grid, n_agents: int, n_landmarks: int) -> None:
         # The table of first moves has one entry per pair of cells.
-        check_count("n_cells", grid.n_cells, 2, 4096)
+        check_count("n_cells", grid.n_cells, 2, MAX_TABLE_CELLS)
         self.n_agents, self.n_landmarks = n_agents, n_landmarks
         distances = np.asarray(grid.distances)  # (C, C), -1 unreachable
         self.distances = np.where(distances < 0, np.iinfo(np.int32).max, distances)
@@ -76,8 +88,15 @@ class NearestLandmarkPolicy:
         self.first_moves = after.argmin(axis=1)  # (C, C): the action that comes nearest
 
     def act(self, observations: np.ndarray) -> np.ndarray:
-        """Return joint actions (B, N)."""
+        """Return joint actions (B, N).
+
+        Raises
+        ------
+        ValueError
+            If the observations have another shape or hold numbers that are no cells or flags.
+        """
         n, k = self.n_agents, self.n_landmarks
+        observations = check_observations(observations, n, k, len(self.distances))
         cells = observations[:, :n].astype(np.int64)
         landmarks = observations[:, n : n + k].astype(np.int64)
         visited = observations[:, n + k :] > 0.5
@@ -88,31 +107,6 @@ class NearestLandmarkPolicy:
         return actions
 
 
-def check_observations(observations: np.ndarray, spec: NetworkSpec) -> np.ndarray:
-    """Return the observations as a fresh float32 array when they can come from the env.
-
-    Raises
-    ------
-    ValueError
-        If the shape is not (B, N + 2K), a cell is none of the grid's, or a flag is not 0 or 1.
-    """
-    array = np.asarray(observations)
-    if array.ndim != 2 or array.shape[1] != spec.observation_size or array.dtype.kind not in "fiub":
-        raise ValueError(
-            f"observations must be numbers of shape (B, {spec.observation_size}), got "
-            f"{array.dtype} of shape {array.shape}"
-        )
-    n_cell_inputs = spec.n_agents + spec.n_landmarks
-    cells, flags = array[:, :n_cell_inputs], array[:, n_cell_inputs:]
-    if not ((cells >= 0) & (cells < spec.n_cells) & (cells == np.floor(cells))).all():
-        raise ValueError(
-            f"observations must have cells in 0..{spec.n_cells - 1}, got something else"
-        )
-    if not ((flags == 0) | (flags == 1)).all():
-        raise ValueError("observations must have visited flags 0 or 1, got something else")
-    return array.astype(np.float32)
-
-
 def save_policy(path: Path, network: PaperNetwork) -> None:
     """Write a network's weights and its spec to a safetensors file, in one piece."""
     # One metadata entry only: safetensors writes several in no fixed order.
@@ -121,7 +115,7 @@ def save_policy(path: Path, network: PaperNetwork) -> None:
     write_atomically(path, safetensors.torch.save(tensors, {WEIGHTS_KEY: about}))
 
 
-def load_policy(path: str | Path) -> NetworkPolicy:
+def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
     """Load a trained policy.
 
     Parameters
@@ -141,10 +135,7 @@ def load_policy(path: str | Path) -> NetworkPolicy:
         have other names, shapes or dtypes than its network, or are not finite. No code is run
         from the file.
     """
-    path = Path(path)
-    file = path / WEIGHTS_FILE if path.is_dir() else path
-    if not file.exists():
-        raise ValueError(f"policy must be a run folder or a weights file, got {str(path)!r}")
+    file = find_weights(path)
     content = read_bytes(file, MAX_WEIGHTS_BYTES)
     spec = read_spec(file, content)
     try:
@@ -173,6 +164,25 @@ def load_policy(path: str | Path) -> NetworkPolicy:
     return NetworkPolicy(network.eval())
 
 
+def find_weights(path: object) -> Path:
+    """Return the weights file that is meant by a run folder or by the file itself.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    try:
+        place = Path(path)  # type: ignore[arg-type]
+        file = place / WEIGHTS_FILE if place.is_dir() else place
+        found = file.exists()
+    except (TypeError, OSError):  # no path at all, or one that the system does not take
+        found = False
+    if not found:
+        raise ValueError(f"path must be a run folder or a weights file, got {reprlib.repr(path)}")
+    return file
+
+
 def read_spec(file: Path, content: bytes) -> NetworkSpec:
     """Read which network the weights in a safetensors file belong to, from its header.
 
@@ -191,7 +201,8 @@ def read_spec(file: Path, content: bytes) -> NetworkSpec:
         if not isinstance(text, str):
             raise ValueError(f"foreign weights: the header has no {WEIGHTS_KEY!r}")
         about = parse_json(text)
-        if not isinstance(about, dict) or about.pop("version", None) != WEIGHTS_VERSION:
+        version = about.pop("version", None) if isinstance(about, dict) else None
+        if type(version) is not int or version != WEIGHTS_VERSION:  # True and 1.0 equal 1
             raise ValueError(f"foreign weights: {WEIGHTS_KEY} is not of version {WEIGHTS_VERSION}")
         return NetworkSpec(**about)
     except (ValueError, TypeError, RecursionError) as error:

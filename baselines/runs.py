@@ -135,6 +135,8 @@ def read_metrics(folder: Path) -> dict[str, list[float]]:
     if not lines:
         raise ValueError(f"{path}: no header line")
     columns = lines[0].split(",")
+    if len(set(columns)) != len(columns):
+        raise ValueError(f"{path}, line 1: a column is there twice")
     table: dict[str, list[float]] = {column: [] for column in columns}
     for number, line in enumerate(lines[1:], start=2):
         fields = line.split(",")

@@ -264,7 +264,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         masks: NDArray[np.int8],
     ) -> None:
         """Add the last observations and infos of the rows of ``ended``."""
-        final_obs = np.full(self.num_envs, None, dtype=object)
+        final_obs = np.empty(self.num_envs, dtype=object)  # of None
         for index, observation in zip(ended.tolist(), observations, strict=True):
             final_obs[index] = observation
         action_mask = np.zeros((self.num_envs, *masks.shape[1:]), np.int8)

@@ -6,6 +6,7 @@ import pytest
 from baselines import evaluate as evaluation_module
 from baselines.evaluate import (
     Setting,
+    count_unseen,
     evaluate,
     format_table,
     save_table,
@@ -28,8 +29,7 @@ def test_costs_equal_those_of_replaying_the_actions(setting):
     """For every problem, replay() of the kept actions gives the same success and costs."""
     problems = unseen_problems(setting, 60)
     for policy in rivals(setting):
-        result = evaluate(policy, setting, problems, keep_actions=True)
-        assert result.actions is not None
+        result = evaluate(policy, setting, problems, n_kept=len(problems))
         for index, landmarks in enumerate(problems.tolist()):
             problem = Problem(setting.grid, landmarks, setting.n_agents, setting.max_cycles)
             plan = replay(problem, result.actions[: result.steps[index], index])
@@ -55,12 +55,12 @@ def test_size_of_the_batch_changes_nothing(monkeypatch):
     """Problems played a few at a time, the last batch not full, give the same figures."""
     problems = unseen_problems(PAPER, 50)
     nearest = rivals(PAPER)[1]
-    whole = evaluate(nearest, PAPER, problems, keep_actions=True)
+    whole = evaluate(nearest, PAPER, problems, n_kept=20)
     monkeypatch.setattr(evaluation_module, "BATCH", 7)
-    parts = evaluate(nearest, PAPER, problems, keep_actions=True)
+    parts = evaluate(nearest, PAPER, problems, n_kept=20)
     for name in ("success", "steps", "cover_time", "makespan", "total_distance"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
-    for index, steps in enumerate(whole.steps):
+    for index, steps in enumerate(whole.steps[:20]):
         np.testing.assert_array_equal(whole.actions[:steps, index], parts.actions[:steps, index])
 
 
@@ -73,6 +73,7 @@ def test_unseen_problems_are_never_training_problems():
     backwards = [cells[::-1] for cells in seen]  # the order of landmarks is no difference
     left = {tuple(row) for row in unseen_problems(setting, 16, backwards).tolist()}
     assert left == everything - set(seen)
+    assert count_unseen(setting, backwards) == 16
     with pytest.raises(ValueError, match="n_problems must be at most 16"):
         unseen_problems(setting, 17, backwards)
 
@@ -96,3 +97,16 @@ def test_table_says_when_nothing_was_solved(tmp_path):
     assert (tmp_path / "evaluation.md").read_text() == table + "\n"
     header, row = (tmp_path / "evaluation.csv").read_text().splitlines()
     assert len(header.split(",")) == len(row.split(",")) == 7
+
+
+def test_only_the_actions_asked_for_are_kept():
+    """Of a thousand problems two byte-sized routes are kept, and none unless asked for."""
+    problems = unseen_problems(PAPER, 1000)
+    nearest = rivals(PAPER)[1]
+    two = evaluate(nearest, PAPER, problems, n_kept=2)
+    assert two.actions.shape == (50, 2, 3)
+    assert two.actions.nbytes == 300
+    assert evaluate(nearest, PAPER, problems).actions.size == 0
+    assert evaluate(nearest, PAPER, problems[:3], n_kept=5).actions.shape == (50, 3, 3)
+    with pytest.raises(ValueError, match=r"n_kept must be .* got -1"):
+        evaluate(nearest, PAPER, problems, n_kept=-1)

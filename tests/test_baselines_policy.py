@@ -9,6 +9,7 @@ import pytest
 import safetensors.torch
 import torch
 
+from baselines.guidance import Guidance, GuidedPolicy
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.policy import (
     WEIGHTS_KEY,
@@ -108,6 +109,8 @@ def test_weights_of_other_shapes_dtypes_or_names_are_refused(tmp_path, weights):
         "[1]",
         "[" * 100_000,
         '{"version": 1}',
+        ABOUT.replace('"version": 1', '"version": true'),
+        ABOUT.replace('"version": 1', '"version": 1.0'),
         ABOUT.replace('"version": 1', '"version": 2'),
         ABOUT.replace("16", "1e999"),
         ABOUT.replace("16", "NaN"),
@@ -163,12 +166,31 @@ def test_missing_and_irregular_files_are_refused(tmp_path):
         np.full((1, 13), 0.5, np.float32),
         np.full((1, 13), 2, np.float32),
         np.array([["a"] * 13]),
+        [[0.0] * 13, [0.0] * 12],
+        [[0.0] * 12 + [[1.0]]],
+        [[None] * 13],
+        None,
     ],
 )
 def test_observations_the_env_cannot_give_are_refused(network, bad):
-    """Wrong shapes, cells off the grid and flags that are none are refused by name."""
+    """Wrong shapes, ragged rows, cells off the grid and flags that are none: refused by name."""
+    grid = make_grid("paper-7x7")
+    chance = RandomPolicy(3, 4, np.random.default_rng(0))
+    guidance = Guidance(grid, 3, 5, 3)
+    for policy in (
+        NetworkPolicy(network),
+        NearestLandmarkPolicy(grid, 3, 5),
+        GuidedPolicy(chance, guidance, 1.0, np.random.default_rng(0)),
+    ):
+        with pytest.raises(ValueError, match=r"^observations must"):
+            policy.act(bad)
+
+
+@pytest.mark.parametrize("bad", [[[1.0], [1.0, 2.0]], np.zeros(13), None, 5, [["a"]]])
+def test_random_policy_wants_rows(bad):
+    """Who looks at nothing still refuses what is no row for each problem."""
     with pytest.raises(ValueError, match=r"^observations must"):
-        NetworkPolicy(network).act(bad)
+        RandomPolicy(3, 4, np.random.default_rng(0)).act(bad)
 
 
 def test_random_policy_takes_every_action_equally_often():
@@ -198,3 +220,18 @@ def test_nearest_landmark_policy_comes_one_step_nearer():
             nearest = grid.distances[here, left].min()
             if nearest:
                 assert grid.distances[there, left].min() == nearest - 1
+
+
+@pytest.mark.parametrize("path", [None, 5, b"x", [], "a" * 5000, "a\0b", object()])
+def test_what_is_no_path_is_refused_by_name(path):
+    """Anything that is not the path of a file or folder is a ValueError that stays short."""
+    with pytest.raises(ValueError, match=r"^path must be a run folder or a weights file") as error:
+        load_policy(path)
+    assert len(str(error.value)) < 200
+
+
+def test_largest_network_can_be_loaded_again(tmp_path):
+    """The most units, agents, landmarks and actions that a spec allows fit under the cap."""
+    spec = NetworkSpec("paper", 16, 64, 5, 512 * 512, 4096)
+    save_policy(tmp_path / "w", build_network(spec, torch_generator(np.random.SeedSequence(0))))
+    assert load_policy(tmp_path / "w").spec == spec

@@ -10,12 +10,15 @@ import time
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tyro
 
 from baselines import evaluate, meta_dqn
+from baselines.figures import draw_learning_curves
 from baselines.policy import load_policy
 from baselines.runs import RunFolder, read_config, read_metrics, write_atomically
+from mapp_env import Grid
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = (
@@ -200,6 +203,7 @@ def test_bad_option_on_the_command_line_is_an_error(tmp_path):
     [
         ("", "no header"),
         ("episode,steps\n1\n", "line 2: 1 fields"),
+        ("episode,steps,steps\n1,2,3\n", "line 1: a column is there twice"),
         ("episode,steps\n1,2\n2,x\n", "line 3: steps: not a number"),
     ],
 )
@@ -237,3 +241,108 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert [item.name for item in tmp_path.iterdir()] == ["weights"]
+
+
+SHORT = {
+    "n_problems": 1,
+    "episodes_per_problem": 2,
+    "hidden_units": 8,
+    "learning_starts": 8,
+    "max_cycles": 10,
+}
+
+
+def test_large_grid_has_no_nearest_landmark_row(tmp_path, capsys):
+    """Above 4,096 cells a run ends well, and says which row of the table it leaves out."""
+    (tmp_path / "large.txt").write_text(Grid(np.zeros((65, 65), dtype=bool)).to_text())
+    grid = str(tmp_path / "large.txt")
+    run = tmp_path / "run"
+    args = meta_dqn.Args(grid=grid, out=run, evaluation_problems=3, **SHORT)
+    assert meta_dqn.main(args) == 0
+    output = capsys.readouterr().out
+    assert output.count("no row for the nearest landmark: the grid has more than 4,096 cells") == 1
+    rows = list(csv.reader((run / "evaluation.csv").read_text().splitlines()))
+    assert rows[-1][0] == "random, guidance 1"
+    assert (run / "fig4_routes.png").exists()
+
+
+@pytest.mark.parametrize(("n_problems", "left"), [(1, 35), (35, 1), (36, 0)])
+def test_evaluation_takes_the_unseen_problems_there_are(tmp_path, capsys, n_problems, left):
+    """A task with few problems is evaluated on those left, or on none, and says how many."""
+    (tmp_path / "tiny.txt").write_text("D....\n.....")
+    options = {**SHORT, "n_problems": n_problems, "episodes_per_problem": 1}
+    run = tmp_path / "run"
+    task = {"grid": str(tmp_path / "tiny.txt"), "n_agents": 1, "n_landmarks": 2}
+    assert meta_dqn.main(meta_dqn.Args(out=run, **task, **options)) == 0
+    line = f"{left} of 1,000 evaluation problems: there are no more unseen ones"
+    assert capsys.readouterr().out.splitlines()[0] == line
+    assert (run / "evaluation.csv").exists() == (left > 0)
+    if left:
+        assert f",{left}," in (run / "evaluation.csv").read_text().splitlines()[1]
+        evaluate.main(evaluate.Args(policy=str(run)))
+        assert f"only {left} of 1,000 problems" in capsys.readouterr().out
+    else:
+        with pytest.raises(ValueError, match=r"^problems: there is none"):
+            evaluate.main(evaluate.Args(policy=str(run)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"max_cycles": 50', '"max_cycles": 1e999', "max_cycles must be .* got inf"),
+        ('"max_cycles": 50', '"max_cycles": 5.9', r"max_cycles must be .* got 5\.9"),
+        ('"max_cycles": 50', '"cycles": 50', "no entry 'max_cycles'"),
+        ('"n_agents": 3', '"n_agents": true', "n_agents must be .* got True"),
+        ('"n_landmarks": 5', '"n_landmarks": 4', r"training_problems\[0\]: must have 4"),
+        ('"training_problems": [', '"training_problems": [[1e999],', r"training_problems\[0\]: "),
+        ('"training_problems": [', '"training_problems": [7,', r"training_problems\[0\]: "),
+        ('"training_problems"', '"training_problems": 1e999, "rest"', "training_problems a list"),
+        ('"options"', '"options": [], "rest"', "options must be an object"),
+        ('"n_agents": 3', '"n_agents": 2', "n_agents is 2 by config.json, and 3 by the weights"),
+    ],
+)
+def test_evaluating_a_damaged_run_is_an_error_with_a_name(two_runs, tmp_path, old, new, message):
+    """What a config cannot say, or its weights contradict, is refused with folder and entry."""
+    folder, _ = two_runs
+    text = (folder / "a" / "config.json").read_text()
+    assert text.count(old) == 1
+    (tmp_path / "config.json").write_text(text.replace(old, new))
+    weights = (folder / "a" / "policy.safetensors").read_bytes()
+    (tmp_path / "policy.safetensors").write_bytes(weights)
+    with pytest.raises(ValueError, match=f"^{tmp_path}.*{message}"):
+        evaluate.main(evaluate.Args(policy=str(tmp_path), problems=5))
+
+
+def test_weights_of_another_grid_are_refused_by_name(two_runs, tmp_path):
+    """A run whose config tells of another grid than its weights is not evaluated."""
+    folder, _ = two_runs
+    config = read_config(folder / "a")
+    config["grid"] = "D" + "\n".join(["." * 8] * 8)[1:]
+    config["training_problems"] = []
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    weights = (folder / "a" / "policy.safetensors").read_bytes()
+    (tmp_path / "policy.safetensors").write_bytes(weights)
+    with pytest.raises(ValueError, match=r"n_cells is 64 by config\.json, and 49 by the weights"):
+        evaluate.main(evaluate.Args(policy=str(tmp_path), problems=5))
+
+
+@pytest.mark.parametrize("column", ["episode", "problem", "steps", "reward"])
+def test_curves_without_a_column_are_refused_by_name(tmp_path, column):
+    """A metrics file that lacks what is drawn is refused with its path and the column."""
+    columns = [name for name in meta_dqn.METRICS if name != column]
+    rows = [",".join(columns), ",".join("1" for _ in columns), ""]
+    (tmp_path / "metrics.csv").write_text("\n".join(rows))
+    with pytest.raises(ValueError, match=rf"metrics\.csv: no column {column}$"):
+        draw_learning_curves(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+
+
+def test_bad_window_on_the_command_line_is_an_error(two_runs):
+    """A running mean over no episodes ends with an error that names it, and no traceback."""
+    folder, _ = two_runs
+    process = start("-m", "baselines.figures", "--run=a", "--window=0", cwd=folder)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert output == ""
+    assert errors.startswith("error: window must be a whole number from 1 ")
+    assert errors.count("\n") == 1

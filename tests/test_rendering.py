@@ -17,7 +17,7 @@ from mapp_env.grid import Grid
 from mapp_env.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering import Scene, ansi, draw_plan, rgb_array
-from mapp_env.rendering.palette import AGENTS, FLAG, agent_colour, to_hex
+from mapp_env.rendering.palette import AGENTS, FLAG, FLAG_VISITED, agent_colour, to_hex
 
 GRID = Grid.from_text(".......\n.##..#.\n.....#.\n..#D...\n.....#.\n.#.....\n...#...\n")
 LANDMARKS = (0, 6, 20, 42, 48)
@@ -442,7 +442,7 @@ def test_draw_plan_draws_on_the_given_axes() -> None:
     texts = legend_of(ax)
     assert f"agent 0: {len(plan.tours[0]) - 1} steps" in texts
     assert f"agent 1: {len(plan.tours[1]) - 1} steps" in texts
-    assert "agent 2: stays home" in texts
+    assert "agent 2: claims nothing" in texts
     assert f"cover time {plan.cover_time} (optimal)" in ax.get_title()
     assert segments(ax, 0)
     assert segments(ax, 1)
@@ -499,6 +499,32 @@ def test_draw_plan_says_what_is_not_visited() -> None:
     assert "not visited" in legend_of(ax)
     assert "not every landmark" in ax.get_title()
     assert draw_plan(problem, plan, title="").get_title() == ""
+
+
+@pytest.mark.parametrize("side", [7, 150])
+def test_draw_plan_frames_the_landmarks_left_out(side: int) -> None:
+    """Every flag is red as in a frame before a visit; a hatched frame, and no grey, marks a miss.
+
+    In a frame grey-green means visited, so a figure must not give it the opposite meaning.
+    """
+    grid = Grid(np.zeros((side, side), dtype=bool), 0)
+    visited, missed = 1, grid.n_cells - 1
+    plan = Plan(((0, 1, 0), ()), ((visited,), ()), np.inf, np.inf, np.inf, status="infeasible")
+    ax = draw_plan(Problem(grid, (visited, missed), 2), plan)
+
+    def cells(patches: Any) -> list[tuple[int, int]]:
+        boxes = [patch.get_window_extent().get_points().mean(axis=0) for patch in patches]
+        middles = ax.transData.inverted().transform(boxes)
+        return [(round(down), round(across)) for across, down in middles]
+
+    def face(patch: Any) -> tuple[int, ...]:
+        return tuple(round(255 * value) for value in patch.get_facecolor()[:3])
+
+    assert cells(patch for patch in ax.patches if patch.get_hatch()) == [(side - 1, side - 1)]
+    assert [face(patch) for patch in ax.patches].count(FLAG) == 2
+    marks = [patch for patch in ax.get_legend().get_patches() if patch.get_hatch()]
+    assert len(marks) == 1
+    assert FLAG_VISITED not in {face(patch) for patch in [*ax.patches, *marks]}
 
 
 @pytest.mark.parametrize(("rows", "cols"), [(1, 2), (2, 1), (200, 200), (1, 512)])

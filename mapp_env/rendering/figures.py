@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -22,7 +22,6 @@ from mapp_env.rendering.palette import (
     DEPOT_CELL,
     FLAG,
     FLAG_CELL,
-    FLAG_VISITED,
     FLOOR,
     GRID_LINE,
     INK,
@@ -41,13 +40,19 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_plan"]
 
-MAX_CELL, MAX_SMALL_SIDE, MAX_LARGE_SIDE, MIN_WIDTH = 0.75, 5.25, 7.5, 5.5  # inches
+MAX_CELL, MAX_SMALL_SIDE, MAX_LARGE_SIDE, MIN_WIDTH = 0.75, 5.25, 7.5, 5.9  # inches
 OUTLINED_SIDE = 64  # grids up to this side have their cells outlined
 LEAST_ICON, MOST_ICON = 11.0, 44.0  # points, of flags and depot
 ARROWS_APART = 13.0  # points, at least
 HOME_PALER = 0.3
 DASHES = (0, (2.4, 1.8))
 LEGEND_COLUMNS = 3
+NOT_VISITED: dict[str, Any] = {
+    "facecolor": to_hex(FLAG_CELL),
+    "edgecolor": to_hex(FLAG),
+    "hatch": "////",
+    "linewidth": 1.4,
+}
 
 Point: TypeAlias = tuple[float, float]  # across and down, in cells; whole numbers are middles
 Move: TypeAlias = tuple[int, int]
@@ -60,7 +65,8 @@ def draw_plan(
 
     One colour and one train of arrows an agent: a full line to its last claim, a dashed one home.
     Routes keep to the right, and those that share a corridor run side by side, so that each can
-    be followed both ways. The legend gives the length of every tour.
+    be followed both ways. The legend gives the length of every tour. Landmarks are red flags,
+    as before a visit; those that the plan leaves out stand in a hatched frame.
 
     Parameters
     ----------
@@ -91,7 +97,9 @@ def draw_plan(
         _draw_tint(ax, grid, problem.landmarks, to_hex(FLAG_CELL))
     _draw_house(ax, grid, icon)
     for cell in problem.landmarks:
-        _draw_flag(ax, grid, cell, icon, visited=cell in claimed)
+        if cell not in claimed:
+            _draw_frame(ax, grid, cell, max(icon, 1.0))
+        _draw_flag(ax, grid, cell, icon)
 
     lanes = _lanes(plan.tours)
     n_lanes = max(lanes) + 1
@@ -199,13 +207,18 @@ def _draw_house(ax: Axes, grid: Grid, size: float) -> None:
         ax.add_patch(Polygon(shape, facecolor=to_hex(colour), linewidth=0, zorder=2))
 
 
-def _draw_flag(ax: Axes, grid: Grid, cell: int, size: float, visited: bool) -> None:
+def _draw_frame(ax: Axes, grid: Grid, cell: int, size: float) -> None:
+    across, down = _middle(grid, cell)
+    corner = (across - size / 2, down - size / 2)
+    ax.add_patch(Rectangle(corner, size, size, zorder=2.1, **NOT_VISITED))
+
+
+def _draw_flag(ax: Axes, grid: Grid, cell: int, size: float) -> None:
     across, down = _middle(grid, cell)
     left, top, foot = across - 0.20 * size, down - 0.40 * size, down + 0.40 * size
     pole = to_hex(INK)
     cloth = [(left, top), (left + 0.55 * size, top + 0.21 * size), (left, top + 0.42 * size)]
-    colour = to_hex(FLAG) if visited else to_hex(FLAG_VISITED)
-    ax.add_patch(Polygon(cloth, facecolor=colour, linewidth=0, zorder=2.2))
+    ax.add_patch(Polygon(cloth, facecolor=to_hex(FLAG), linewidth=0, zorder=2.2))
     ax.add_patch(
         Rectangle(
             (left - 0.03 * size, top - 0.04 * size),
@@ -372,7 +385,7 @@ def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
             label = f"agent {agent}: {length} step{'s' if length > 1 else ''}"
             entries.append(Line2D([], [], color=colour, linewidth=2.4, label=label))
         else:
-            label = f"agent {agent}: stays home"
+            label = f"agent {agent}: claims nothing"
             entries.append(
                 Line2D(
                     [], [], color=colour, linestyle="none", marker="s", markersize=5, label=label
@@ -383,9 +396,7 @@ def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
     ink = to_hex(INK)
     entries.append(Line2D([], [], color=ink, linewidth=1.6, label="to the last landmark"))
     entries.append(Line2D([], [], color=ink, linewidth=1.6, linestyle=DASHES, label="way home"))
-    entries.append(
-        Patch(color=to_hex(FLAG_VISITED), label="not visited") if some_unvisited else nothing
-    )
+    entries.append(Patch(label="not visited", **NOT_VISITED) if some_unvisited else nothing)
     # Matplotlib fills column by column; people read row by row.
     by_column = [entry for col in range(LEGEND_COLUMNS) for entry in entries[col::LEGEND_COLUMNS]]
     ax.legend(
@@ -395,8 +406,8 @@ def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
         ncols=LEGEND_COLUMNS,
         frameon=False,
         fontsize=9,
-        columnspacing=1.2,
-        handlelength=2.0,
+        columnspacing=1.0,
+        handlelength=1.8,
     )
 
 
