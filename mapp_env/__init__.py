@@ -10,15 +10,18 @@ from __future__ import annotations
 import gymnasium
 import pettingzoo
 
-from mapp_env import mapp_v0
+from mapp_env import mapp_v0, solvers
+from mapp_env.files import FileError
 from mapp_env.grid import Grid
 from mapp_env.grids import grid_names, make_grid
 from mapp_env.map_format import MapError
 from mapp_env.plan import Plan, replay
 from mapp_env.problem import Problem, sample_problems
+from mapp_env.solvers import solve
 from mapp_env.vector_env import make_vec
 
 __all__ = [
+    "FileError",
     "Grid",
     "MapError",
     "Plan",
@@ -30,6 +33,8 @@ __all__ = [
     "mapp_v0",
     "replay",
     "sample_problems",
+    "solve",
+    "solvers",
 ]
 
 __version__ = "0.1.0"

@@ -8,14 +8,13 @@ same rows below a header of ``type``, ``height``, ``width`` and ``map`` lines, a
 
 from __future__ import annotations
 
-import os
 import re
-import stat
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapp_env.files import read_bytes
 from mapp_env.validation import describe
 
 __all__ = ["MAX_FILE_BYTES", "MAX_SIDE", "MapError", "ParsedMap", "parse_map", "read_map"]
@@ -57,23 +56,7 @@ def read_map(source: str) -> ParsedMap:
         If the file cannot be opened, is not a regular file, is too large or is malformed. Nothing
         is read before the file is known to be regular, so that a pipe or a device cannot block.
     """
-    try:
-        # Non-blocking: opening a FIFO that nobody writes to would otherwise wait for ever.
-        handle = os.open(source, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    except (OSError, ValueError) as error:
-        raise MapError(f"{describe(source)}: cannot be opened as a map file: {error}") from error
-    try:
-        status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode):
-            raise MapError(f"{source}: is not a regular file")
-        if status.st_size > MAX_FILE_BYTES:
-            raise MapError(
-                f"{source}: has {status.st_size} bytes, a map file may have {MAX_FILE_BYTES}"
-            )
-        with os.fdopen(handle, "rb", closefd=False) as file:
-            data = file.read(MAX_FILE_BYTES + 1)
-    finally:
-        os.close(handle)
+    data = read_bytes(source, MAX_FILE_BYTES, "a map file", MapError)
     try:
         text = data.decode("ascii")
     except UnicodeDecodeError as error:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.files import MAX_PROBLEM_BYTES, FileError, Record, read_record, write_record
 from mapp_env.grid import Grid
 from mapp_env.validation import check_count, describe
 
@@ -67,6 +70,60 @@ class Problem:
         if self.max_cycles is not None:
             limit = check_count("max_cycles", self.max_cycles, 1, MAX_CYCLES)
             object.__setattr__(self, "max_cycles", limit)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the problem as JSON, grid included, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or os.PathLike
+            The file; replaced if it is there.
+
+        Raises
+        ------
+        ValueError
+            If the file cannot be written.
+        """
+        write_record(path, "problem", self.to_record(), MAX_PROBLEM_BYTES)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Problem:
+        """Read a problem from a file that :meth:`save` wrote.
+
+        Raises
+        ------
+        ValueError
+            If it is not such a file, in any detail.
+        """
+        return cls.from_record(read_record(path, "problem", MAX_PROBLEM_BYTES))
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the problem as the fields of a file."""
+        return {
+            "grid": self.grid.to_text(),
+            "landmarks": self.landmarks,
+            "n_agents": self.n_agents,
+            "max_cycles": self.max_cycles,
+        }
+
+    @classmethod
+    def from_record(cls, record: Record) -> Problem:
+        """Return the problem that the fields of a file describe.
+
+        Raises
+        ------
+        FileError
+            If a field is missing, unknown or not as it must be.
+        """
+        text = record.text("grid", MAX_PROBLEM_BYTES)
+        landmarks = record.cells("landmarks")
+        n_agents = record.number("n_agents")
+        max_cycles = record.number("max_cycles", null=None)
+        record.finish()
+        try:
+            return cls(Grid.from_text(text), landmarks, n_agents, max_cycles)
+        except ValueError as error:
+            raise FileError(f"{record.where}: {error}") from error
 
 
 def check_grid(name: str, value: object) -> Grid:

@@ -18,11 +18,12 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # From the bottom up; a file may import what stands lower, or beside it.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("validation", "compiled"),
+    ("files",),
     ("map_format",),
     ("grid",),
     ("grids",),
     ("problem", "scene"),
-    ("dynamics", "observation", "plan", "solvers", "rendering", "task"),
+    ("dynamics", "observation", "walking", "plan", "solvers", "rendering", "task"),
     ("rows", "row_seeds", "display"),
     ("simulation",),
     ("parallel_env", "central_env", "vector_env"),

@@ -1,0 +1,192 @@
+"""What the solvers find, how soon, and how far from the best known: one table.
+
+Landmarks are drawn at random on `paper-7x7` and on generated grids. "best known" is the proven
+optimum where the exact solver can take the problem, else the best of all methods and of a search of
+three times the time with another seed. One thread; figures of time drift with the machine.
+
+    python benchmarks/solvers.py            # five minutes; --seconds 0.2 --instances 1 for a glance
+    python benchmarks/solvers.py --grid rooms --objective makespan
+"""
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse
+import importlib.util
+import time
+from collections.abc import Callable, Sequence
+from statistics import mean, median
+from typing import NamedTuple
+
+import numpy as np
+
+from mapp_env import Grid, Problem, make_grid
+from mapp_env.plan import OBJECTIVES
+from mapp_env.solvers.bounds import cell_distances
+from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
+from mapp_env.solvers.search import Search
+
+SIZES = (  # side of the grid, landmarks, agents
+    (7, 5, 3),
+    (32, 20, 5),
+    (64, 50, 10),
+    (64, 100, 2),
+    (64, 100, 3),
+    (64, 100, 5),
+)
+REFERENCE = 3  # times as long as the others, for what cannot be solved exactly
+
+
+class Case(NamedTuple):
+    """One problem. A `Problem` has at most 64 landmarks, so distances are what is solved here."""
+
+    grid: Grid
+    cells: list[int]  # depot first
+    distances: np.ndarray  # (K + 1, K + 1) int32
+    n_agents: int
+
+
+class Found(NamedTuple):
+    """What a method found."""
+
+    cost: int
+    seconds: float  # until then
+
+
+def draw_case(kind: str, side: int, n_landmarks: int, n_agents: int, seed: int) -> Case:
+    """Return the problem of a seed."""
+    options = {"rows": side, "cols": side, "seed": seed}
+    grid = make_grid("paper-7x7") if side == 7 else make_grid(kind, **options)
+    rng = np.random.default_rng([side, n_landmarks, seed])
+    cells = [grid.depot, *rng.choice(grid.reachable, n_landmarks, replace=False).tolist()]
+    return Case(grid, cells, cell_distances(grid, np.array(cells)), n_agents)
+
+
+def exact(case: Case, objective: str, seconds: float) -> Found:
+    """Prove the optimum."""
+    problem = Problem(case.grid, case.cells[1:], case.n_agents)
+    start = time.perf_counter()
+    return Found(solve_exact(problem, objective).bound, time.perf_counter() - start)
+
+
+def search(case: Case, objective: str, seconds: float, seed: int = 0) -> Found:
+    """Ruin and recreate for so many seconds."""
+    start = time.perf_counter()
+    run = Search(case.distances, case.n_agents, objective, seed)
+    best = Found(2**60, 0.0)
+    while (spent := time.perf_counter() - start) < seconds or best.seconds == 0:
+        run.run(100)
+        if run.cost < best.cost:
+            best = Found(run.cost, max(time.perf_counter() - start, spent))
+    return best
+
+
+def pyvrp(case: Case, objective: str, seconds: float) -> Found:
+    """PyVRP for so many seconds."""
+    from mapp_env.solvers.pyvrp import search_routes
+
+    start = time.perf_counter()
+    best: list[Found] = []
+    search_routes(
+        case.distances,
+        case.n_agents,
+        objective,
+        start + seconds,
+        on_better=lambda cost: best.append(Found(cost, time.perf_counter() - start)),
+    )
+    return best[-1]
+
+
+def nearest_landmark(case: Case, objective: str, seconds: float) -> Found:
+    """Let the agent that can be first on a landmark go there, until all are visited."""
+    start = time.perf_counter()
+    n_agents = 1 if objective == "total_distance" else case.n_agents
+    at = np.zeros(n_agents, int)
+    steps = np.zeros(n_agents, int)
+    left = np.arange(1, len(case.cells))
+    while left.size:
+        arrival = steps[:, None] + case.distances[at][:, left]
+        agent, index = np.unravel_index(np.argmin(arrival), arrival.shape)
+        steps[agent], at[agent] = arrival[agent, index], left[index]
+        left = np.delete(left, index)
+    if objective != "cover_time":
+        steps += case.distances[at, 0]
+    return Found(int(steps.max()), time.perf_counter() - start)
+
+
+METHODS: dict[str, Callable[[Case, str, float], Found]] = {
+    "exact": exact,
+    "search": search,
+    "pyvrp": pyvrp,
+    "nearest landmark": nearest_landmark,
+}
+
+
+def compare(cases: Sequence[Case], objective: str, seconds: float) -> list[str]:
+    """Return one line of the table for each method."""
+    small = len(cases[0].cells) - 1 <= MAX_EXACT_LANDMARKS
+    found: dict[str, list[Found]] = {}
+    for name, method in METHODS.items():
+        if name == "exact" and not small:
+            continue
+        if name == "pyvrp" and importlib.util.find_spec("pyvrp") is None:
+            continue
+        found[name] = [method(case, objective, seconds) for case in cases]
+    best = [min(results).cost for results in zip(*found.values(), strict=True)]
+    if small:
+        assert best == [result.cost for result in found["exact"]], "below the optimum"
+    else:
+        longer = [search(case, objective, REFERENCE * seconds, seed=1) for case in cases]
+        best = [min(one, other.cost) for one, other in zip(best, longer, strict=True)]
+    lines = []
+    for name, results in found.items():
+        gaps = [result.cost / one - 1 for result, one in zip(results, best, strict=True)]
+        lines.append(
+            f"{name:<16} | {mean(result.cost for result in results):7.1f} "
+            f"| {1000 * median(result.seconds for result in results):9.1f} "
+            f"| {100 * mean(gaps):6.2f} | {sum(gap == 0 for gap in gaps):3d}/{len(gaps)}"
+        )
+    return lines
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=1.0, help="of each search")
+    parser.add_argument("--instances", type=int, default=3, help="of each size")
+    parser.add_argument("--grid", default="random", help="generator of the larger grids")
+    parser.add_argument("--objective", choices=OBJECTIVES, help="only this one")
+    args = parser.parse_args()
+    # Compile, and load what is compiled, outside the times.
+    for objective in OBJECTIVES:
+        compare([draw_case(args.grid, 7, 3, 2, 0)], objective, 0.01)
+    print(
+        f"{args.seconds:g} s for each search, {args.instances} problems of each size, "
+        f"{args.grid} grids\n"
+    )
+    print(
+        "grid / landmarks / agents | objective      | method           |    cost "
+        "| ms to best | gap % | best"
+    )
+    print("|".join("-" * width for width in (26, 16, 18, 9, 12, 7, 6)))
+    for side, n_landmarks, n_agents in SIZES:
+        size = f"{side}x{side} / {n_landmarks} / {n_agents}"
+        cases = [
+            draw_case(args.grid, side, n_landmarks, n_agents, seed)
+            for seed in range(args.instances)
+        ]
+        for objective in OBJECTIVES:
+            # One agent's tour, whatever the number of agents: once for a number of landmarks.
+            repeated = objective == "total_distance" and n_landmarks == 100 and n_agents > 2
+            if repeated or args.objective not in (None, objective):
+                continue
+            for line in compare(cases, objective, args.seconds):
+                print(f"{size:<25} | {objective:<14} | {line}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

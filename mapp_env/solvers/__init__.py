@@ -1,0 +1,124 @@
+"""Solvers: one signature, one file each; :func:`solve` turns what they find into plans."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from mapp_env.plan import OBJECTIVES, Plan, replay
+from mapp_env.problem import Problem
+from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
+from mapp_env.solvers.solution import Routes, Solution, Solver
+from mapp_env.solvers.universe import solve_universe
+from mapp_env.solvers.vrplib import save_vrplib
+from mapp_env.validation import MAX_SEED, check_choice, check_count, describe
+from mapp_env.walking import tour_through, walk_tours
+
+__all__ = ["METHODS", "Solution", "save_vrplib", "solve", "solve_universe"]
+
+METHODS = ("auto", "exact", "search", "pyvrp")
+
+QUICK_LANDMARKS = 16
+"""Up to so many landmarks the exact solver takes a fraction of a second; up to 20, two seconds."""
+
+
+def solve(
+    problem: Problem,
+    objective: str = "cover_time",
+    method: str = "auto",
+    time_limit: float | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Return a plan of a problem that is short in one objective, and what is proven about it.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its step limit is ignored: it belongs to an episode, not to the optimum.
+    objective : {"cover_time", "makespan", "total_distance"}
+        What is minimised. Ties in the first two go to the smaller total distance, with "exact"
+        always.
+    method : {"auto", "exact", "search", "pyvrp"}
+        "exact" proves the optimum of up to 20 landmarks; "search" takes problems of any size and
+        proves the optimum only where it meets a lower bound; "pyvrp" is another search, from the
+        package of that name. "auto" is "exact" up to 20 landmarks (16, if ``time_limit`` is less
+        than two seconds), else "search".
+    time_limit : float, optional
+        Seconds that a search may take; "exact" has no use for it.
+    seed : int
+        Of a search.
+
+    Returns
+    -------
+    Plan
+        ``status`` is "optimal" if the cost equals ``bound``, a proven lower bound, else "feasible".
+        All costs are what the rules give for ``plan.joint_actions()``.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as said, or the method cannot take the problem; the message names one
+        that can.
+    """
+    if not isinstance(problem, Problem):
+        raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
+    check_choice("objective", objective, OBJECTIVES)
+    check_choice("method", method, METHODS)
+    limit = _check_time_limit(time_limit)
+    seed = check_count("seed", seed, 0, MAX_SEED)
+    start = time.perf_counter()
+    if method == "auto":
+        hurried = limit is not None and limit < 2
+        quick = QUICK_LANDMARKS if hurried else MAX_EXACT_LANDMARKS
+        method = "exact" if len(problem.landmarks) <= quick else "search"
+    solution = _solver(method)(problem, objective, time_limit=limit, seed=seed)
+    plan = _plan_of(problem, objective, solution)
+    return replace(plan, solver=method, seconds=time.perf_counter() - start)
+
+
+def _solver(method: str) -> Solver:
+    if method == "search":
+        from mapp_env.solvers.search import solve_search
+
+        return solve_search
+    if method == "pyvrp":
+        from mapp_env.solvers.pyvrp import solve_pyvrp
+
+        return solve_pyvrp
+    return solve_exact
+
+
+def _check_time_limit(value: object) -> float | None:
+    """Return a time limit as a float, or None."""
+    if value is None:
+        return None
+    number = not isinstance(value, bool) and isinstance(value, int | float | np.number)
+    if not number or not 0 < value < math.inf:  # type: ignore[operator]
+        raise ValueError(f"time_limit must be a positive number or None, got {describe(value)}")
+    return float(value)  # type: ignore[arg-type]
+
+
+def _plan_of(problem: Problem, objective: str, solution: Solution) -> Plan:
+    """Return what the rules make of a solver's routes."""
+    # Agents are exchangeable; those without a route come last, see walk_tours().
+    routes = sorted(solution.routes, key=lambda route: not route)
+    _check_routes(problem, solution.routes)
+    tours = [tour_through(problem.grid, route) for route in routes]
+    actions = walk_tours(problem, tours)
+    plan = replay(replace(problem, max_cycles=None), actions, objective)
+    if plan.cost < solution.bound or (solution.optimal and plan.cost != solution.bound):
+        raise RuntimeError(
+            f"a solver claims the bound {solution.bound} (optimal={solution.optimal}), but its "
+            f"routes cost {plan.cost}: please report {problem!r}, objective {objective!r}"
+        )
+    status = "optimal" if plan.cost == solution.bound else "feasible"
+    return replace(plan, problem=problem, status=status, bound=solution.bound)
+
+
+def _check_routes(problem: Problem, routes: Routes) -> None:
+    cells = sorted(cell for route in routes for cell in route)
+    if len(routes) != problem.n_agents or cells != sorted(problem.landmarks):
+        raise RuntimeError(f"a solver returned broken routes {routes!r} for {problem!r}")

@@ -1,0 +1,359 @@
+"""Files of problems, plans and distances: what is written is read back, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import vrplib
+
+import mapp_env
+from mapp_env import FileError, Grid, Plan, Problem, make_grid, replay, solve
+from mapp_env.files import MAX_PLAN_BYTES, MAX_PROBLEM_BYTES, write_text
+from mapp_env.solvers import save_vrplib
+from mapp_env.solvers.bounds import landmark_distances
+
+# With claims at step 1 and on cell 0, which Python takes for True and False.
+PROBLEM = Problem(make_grid(), (48, 0, 6, 25), 2, max_cycles=40)
+
+
+def random_plan(rng: np.random.Generator) -> Plan:
+    """Return a plan of a random problem, solved or only played."""
+    walls = rng.random((rng.integers(2, 9), rng.integers(2, 9))) < 0.2
+    walls[0, 0] = False
+    walls[0, 1] = False
+    grid = Grid(walls, 0)
+    count = int(rng.integers(1, min(6, grid.reachable.size) + 1))
+    landmarks = rng.choice(grid.reachable, count, replace=False).tolist()
+    problem = Problem(grid, landmarks, int(rng.integers(1, 4)), [None, 7][rng.integers(2)])
+    objective = mapp_env.plan.OBJECTIVES[rng.integers(3)]
+    if rng.integers(2):
+        return solve(problem, objective)
+    return replay(problem, rng.integers(0, 5, (rng.integers(30), problem.n_agents)), objective)
+
+
+# -- there and back ------------------------------------------------------
+
+
+def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
+    """Problems and plans of all kinds come back equal, infinite costs included."""
+    rng = np.random.default_rng(0)
+    infinite = 0
+    for _ in range(100):
+        plan = random_plan(rng)
+        plan.save(tmp_path / "plan.json")
+        loaded = Plan.load(str(tmp_path / "plan.json"))
+        assert loaded == plan
+        assert loaded.seconds == plan.seconds
+        assert loaded.problem == plan.problem
+        infinite += not loaded.success
+        assert isinstance(plan.problem, Problem)
+        plan.problem.save(tmp_path / "problem.json")
+        assert Problem.load(tmp_path / "problem.json") == plan.problem
+    assert 5 < infinite < 60
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["plan.json", "problem.json"]
+
+
+def test_files_are_plain_json(tmp_path: Path) -> None:
+    """Any JSON reader finds the grid as text, and null for a cost that is infinite."""
+    replay(PROBLEM, [[0, 0]]).save(tmp_path / "plan.json")
+    fields = json.loads((tmp_path / "plan.json").read_text("ascii"))
+    assert fields["problem"]["grid"] == PROBLEM.grid.to_text()
+    assert fields["cover_time"] is None
+    assert (fields["format"], fields["version"]) == ("mapp_env plan", 1)
+
+
+def test_the_largest_grid_fits(tmp_path: Path) -> None:
+    """A problem on a 512 x 512 grid is within the caps."""
+    grid = Grid(np.zeros((512, 512), bool))
+    problem = Problem(grid, (0, 512 * 512 - 1), 1)
+    problem.save(tmp_path / "problem.json")
+    assert Problem.load(tmp_path / "problem.json") == problem
+    plan = solve(problem)
+    plan.save(tmp_path / "plan.json")
+    assert Plan.load(tmp_path / "plan.json") == plan
+
+
+# -- what strangers may send ---------------------------------------------
+
+
+def fields_of(kind: str, folder: Path) -> dict[str, Any]:
+    """Return the fields of a good file of a kind."""
+    path = folder / "good.json"
+    if kind == "plan":
+        solve(PROBLEM).save(path)
+    else:
+        PROBLEM.save(path)
+    fields: dict[str, Any] = json.loads(path.read_text())
+    return fields
+
+
+def load(kind: str, path: Path) -> object:
+    """Load a file as what it should be."""
+    return Plan.load(path) if kind == "plan" else Problem.load(path)
+
+
+def leaves(value: object, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Return the path to every value inside a JSON value, containers included."""
+    found = [path] if path else []
+    if isinstance(value, dict):
+        for key, item in value.items():
+            found += leaves(item, (*path, key))
+    if isinstance(value, list):
+        for index, item in enumerate(value):
+            found += leaves(item, (*path, index))
+    return found
+
+
+def changed(value: Any, path: tuple[Any, ...], new: str) -> str:
+    """Return JSON text with the value at ``path`` replaced by the text ``new``."""
+    copy = json.loads(json.dumps(value))
+    inner = copy
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = "@@"
+    return json.dumps(copy).replace('"@@"', new)
+
+
+WRONG_VALUES = (
+    "true", "false", "NaN", "Infinity", "-Infinity", "1e999", "-1", "1.5", "0.0", '""', '"x"',
+    "[]", "{}", "9007199254740993", "[[[[]]]]", '{"a": 1}', "99999999999999999999999999",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["problem", "plan"])
+def test_no_value_can_be_replaced(kind: str, tmp_path: Path) -> None:
+    """Whatever value of a file is replaced by a strange one, the file is refused.
+
+    But for two that say nothing about the plan: its time and its solver's name.
+    """
+    fields = fields_of(kind, tmp_path)
+    path = tmp_path / "bad.json"
+    refused = 0
+    for place in leaves(fields):
+        inner = fields
+        for key in place:
+            inner = inner[key]
+        for value in WRONG_VALUES:
+            if place == ("seconds",) and value in ("1.5", "0.0"):
+                continue
+            if place == ("solver",) and value in ('""', '"x"'):
+                continue
+            if json.dumps(inner) == value:
+                continue
+            path.write_text(changed(fields, place, value))
+            with pytest.raises(FileError, match=r"bad\.json"):
+                load(kind, path)
+            refused += 1
+    assert refused > 100
+
+
+@pytest.mark.parametrize("kind", ["problem", "plan"])
+def test_fields_are_exactly_these(kind: str, tmp_path: Path) -> None:
+    """A missing field, an unknown one and one that comes twice are refused, inner ones too."""
+    fields = fields_of(kind, tmp_path)
+    path = tmp_path / "bad.json"
+    for place in leaves(fields):
+        if not isinstance(place[-1], str):
+            continue
+        copy = json.loads(json.dumps(fields))
+        inner = copy
+        for key in place[:-1]:
+            inner = inner[key]
+        value = inner.pop(place[-1])
+        path.write_text(json.dumps(copy))
+        with pytest.raises(FileError, match="lacks the field"):
+            load(kind, path)
+        inner[place[-1]] = value
+        inner["@@"] = value
+        path.write_text(json.dumps(copy).replace("@@", str(place[-1])))
+        with pytest.raises(FileError, match="same key twice"):
+            load(kind, path)
+        path.write_text(json.dumps(copy))
+        with pytest.raises(FileError, match="unknown field '@@'"):
+            load(kind, path)
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "-Infinity", "1e999", "-1e400"])
+def test_json_has_no_such_numbers(value: str, tmp_path: Path) -> None:
+    """What is no finite number is refused as no JSON, before any field is looked at."""
+    (tmp_path / "bad.json").write_text(f'{{"x": [{value}]}}')
+    with pytest.raises(FileError, match="is not strict JSON"):
+        Plan.load(tmp_path / "bad.json")
+
+
+HOSTILE: dict[str, bytes] = {
+    "nothing": b"",
+    "blank": b"   ",
+    "a list": b"[]",
+    "null": b"null",
+    "a number": b"1",
+    "cut off": b'{"format": "mapp_env plan", "version": 1',
+    "two objects": b"{} {}",
+    "not UTF-8": b"\xff\xfe{}",
+    "byte order mark": b"\xef\xbb\xbf{}",
+    "zeros": bytes(1000),
+    "deep list": b"[" * 500_000,
+    "deep object": b'{"a":' * 200_000,
+    "deep and closed": b'{"format": ' + b"[" * 900 + b"]" * 900 + b"}",
+    "deeper and closed": b'{"format": ' + b"[" * 100_000 + b"]" * 100_000 + b"}",
+    "huge number": b'{"format": ' + b"9" * 500_000 + b"}",
+    "comment": b'{"format": "mapp_env plan" /* 1 */}',
+    "other kind": b'{"format": "mapp_env tour", "version": 1}',
+    "no version": b'{"format": "mapp_env plan"}',
+    "later version": b'{"format": "mapp_env plan", "version": 2}',
+    "lone surrogate": b'{"format": "\\ud800"}',
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize("kind", ["problem", "plan"])
+def test_hostile_files_are_refused(kind: str, name: str, tmp_path: Path) -> None:
+    """Each is a FileError that names the path, in under a second."""
+    path = tmp_path / "hostile.json"
+    path.write_bytes(HOSTILE[name])
+    start = time.perf_counter()
+    with pytest.raises(FileError, match=r"hostile\.json") as caught:
+        load(kind, path)
+    assert time.perf_counter() - start < 1
+    assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("kind", ["problem", "plan"])
+def test_odd_files_are_refused(kind: str, tmp_path: Path) -> None:
+    """A pipe, a folder, a device, a missing and a huge file are refused at once."""
+    os.mkfifo(tmp_path / "pipe")
+    with open(tmp_path / "huge", "wb") as file:
+        file.truncate(1 << 34)
+    cap = MAX_PLAN_BYTES if kind == "plan" else MAX_PROBLEM_BYTES
+    (tmp_path / "large").write_bytes(b" " * (cap + 1))
+    names = ["pipe", "huge", "large", "missing", "", "nul\0byte", "/dev/zero"]
+    for name in names:
+        start = time.perf_counter()
+        with pytest.raises(FileError):
+            load(kind, tmp_path / name)
+        assert time.perf_counter() - start < 1
+    with pytest.raises(FileError, match="path must be"):
+        load(kind, 3)  # type: ignore[arg-type]
+
+
+def test_a_file_says_what_it_is(tmp_path: Path) -> None:
+    """A problem is not read as a plan, nor the other way round."""
+    solve(PROBLEM).save(tmp_path / "plan.json")
+    PROBLEM.save(tmp_path / "problem.json")
+    with pytest.raises(FileError, match="'format' must be one of mapp_env problem"):
+        Problem.load(tmp_path / "plan.json")
+    with pytest.raises(FileError, match="'format' must be one of mapp_env plan"):
+        Plan.load(tmp_path / "problem.json")
+
+
+def test_flipped_bytes_never_crash(tmp_path: Path) -> None:
+    """Whatever bytes are flipped, a file loads to a plan that verifies, or raises FileError."""
+    solve(PROBLEM).save(tmp_path / "plan.json")
+    good = (tmp_path / "plan.json").read_bytes()
+    rng = np.random.default_rng(3)
+    path = tmp_path / "flipped.json"
+    refused = 0
+    for _ in range(1500):
+        data = bytearray(good)
+        for _ in range(rng.integers(1, 4)):
+            data[rng.integers(len(data))] = rng.choice(
+                [*b'0123456789"{}[],:-.eE ', rng.integers(256)]
+            )
+        path.write_bytes(data)
+        try:
+            plan = Plan.load(path)
+        except FileError:
+            refused += 1
+        else:
+            plan.verify()
+    assert refused > 1000
+
+
+def test_a_tampered_plan_is_refused(tmp_path: Path) -> None:
+    """A file that states a better cost than its actions give is refused."""
+    fields = fields_of("plan", tmp_path)
+    path = tmp_path / "bad.json"
+    for name in ("cover_time", "makespan", "total_distance", "bound"):
+        path.write_text(json.dumps({**fields, name: fields[name] - 1}))
+        with pytest.raises(FileError, match=r"bad\.json: plan: "):
+            Plan.load(path)
+
+
+# -- writing -------------------------------------------------------------
+
+
+def test_a_failed_write_leaves_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If writing fails at any stage, the file before it is whole and nothing else is left."""
+    path = tmp_path / "problem.json"
+    PROBLEM.save(path)
+    before = path.read_bytes()
+
+    def broken(*_: object) -> None:
+        raise OSError("no room")
+
+    for name in ("fsync", "replace"):
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, broken)
+            with pytest.raises(FileError, match="no room"):
+                Problem(make_grid(), (0,)).save(path)
+        assert path.read_bytes() == before
+        assert list(tmp_path.iterdir()) == [path]
+
+
+def test_only_regular_files_are_replaced(tmp_path: Path) -> None:
+    """A folder or a pipe is not replaced, a link keeps its place, a missing folder is named."""
+    os.mkfifo(tmp_path / "pipe")
+    for target in (tmp_path, tmp_path / "pipe", tmp_path / "missing" / "problem.json"):
+        with pytest.raises(FileError):
+            PROBLEM.save(target)
+    (tmp_path / "link").symlink_to(tmp_path / "problem.json")
+    PROBLEM.save(tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert Problem.load(tmp_path / "problem.json") == PROBLEM
+    with pytest.raises(FileError, match="path must be"):
+        PROBLEM.save(3)  # type: ignore[arg-type]
+    with pytest.raises(FileError, match="allowed are 3"):
+        write_text(tmp_path / "text", "four", 3)
+    assert not (tmp_path / "text").exists()
+
+
+def test_a_broken_plan_is_not_saved(tmp_path: Path) -> None:
+    """What would not load is not written."""
+    by_hand = Plan(((24, 25, 24), ()), ((25,), ()), 1, 2, 3, problem=Problem(make_grid(), (25,), 2))
+    with pytest.raises(ValueError, match="total_distance is stated as 3"):
+        by_hand.save(tmp_path / "plan.json")
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- distances for other solvers -----------------------------------------
+
+
+def test_vrplib_is_read_by_an_independent_reader(tmp_path: Path) -> None:
+    """The vrplib package reads the matrix, the demands and the depot that were written."""
+    rng = np.random.default_rng(4)
+    for n_landmarks in (1, 2, 17, 64):
+        walls = rng.random((20, 30)) < 0.2
+        walls[10, 15] = False
+        grid = Grid(walls, (10, 15))
+        landmarks = rng.choice(grid.reachable, n_landmarks, replace=False).tolist()
+        problem = Problem(grid, landmarks, 4)
+        save_vrplib(problem, tmp_path / "problem.vrp")
+        instance = vrplib.read_instance(tmp_path / "problem.vrp")
+        expected = landmark_distances(problem)
+        np.testing.assert_array_equal(instance["edge_weight"], expected)
+        cells = [grid.depot, *landmarks]
+        np.testing.assert_array_equal(expected, grid.distances[np.ix_(cells, cells)])
+        assert instance["edge_weight_type"] == "EXPLICIT"
+        assert instance["edge_weight_format"] == "FULL_MATRIX"
+        assert instance["dimension"] == n_landmarks + 1
+        assert instance["vehicles"] == 4
+        assert instance["demand"].tolist() == [0] + [1] * n_landmarks
+        assert instance["depot"].tolist() == [0]
