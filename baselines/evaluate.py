@@ -1,215 +1,46 @@
-"""Evaluate a policy on problems it was not trained on.
+"""Evaluate a policy, each result beside the proven optimum.
 
 Command::
 
     python baselines/evaluate.py --policy runs/meta_dqn-paper-seed0-... --problems 1000
-    python baselines/evaluate.py --policy nearest --problems 1000
+    python baselines/evaluate.py --policy nearest --problems universe
 
-Output: a table with the share of problems solved, the steps, the total distance and the makespan.
-A problem is solved when every landmark was visited within the step limit; costs are means over
-the solved problems, and the steps are shown a second time over all problems, an unsolved one
-counted with the step limit.
+Output: a table with the share of problems solved; of the cover time the mean gap to the proven
+optimum, the share of optimal problems and the largest gap; and the means of all three costs. A
+problem is solved when every landmark was visited within the step limit; gaps and costs are those
+of the solved problems, and the cover time is shown a second time over all problems, an unsolved
+one counted with the step limit.
 """
 
-import csv
-import io
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-import gymnasium
 import numpy as np
 import torch
 import tyro
 
 from baselines.checks import check_count, check_number
+from baselines.evaluation import (
+    EVALUATION_SEED,
+    Evaluation,
+    Setting,
+    count_problems,
+    count_unseen,
+    evaluate,
+    every_problem,
+    find_optima,
+    format_table,
+    save_table,
+    unseen_problems,
+)
 from baselines.guidance import Acting, Guidance, GuidedPolicy
 from baselines.networks import NetworkSpec
 from baselines.policy import NearestLandmarkPolicy, RandomPolicy, load_policy
-from baselines.runs import CONFIG_FILE, read_config, write_atomically
-from mapp_env import Grid, Problem, grid_names, make_grid, make_vec, sample_problems
+from baselines.runs import CONFIG_FILE, read_config
+from mapp_env import Grid, Problem, grid_names, make_grid
 
-# Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
-# from streams spawned from their own seeds; those that coincide are left out one by one.
-EVALUATION_SEED = 0
-BATCH = 4096  # problems played at a time
 N_ACTIONS = 4
-N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What the agents have to do, but for the landmarks' places."""
-
-    grid: Grid
-    n_agents: int = 3
-    n_landmarks: int = 5
-    max_cycles: int = 50
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """What came out on P problems; costs are infinite where not every landmark was visited."""
-
-    setting: Setting
-    landmarks: np.ndarray  # (P, K) int32
-    success: np.ndarray  # (P,) bool
-    steps: np.ndarray  # (P,) int64, until the last landmark or the step limit
-    cover_time: np.ndarray  # (P,) float64
-    makespan: np.ndarray  # (P,) float64, the way home included (R8)
-    total_distance: np.ndarray  # (P,) float64, the way home included (R8)
-    actions: np.ndarray  # (T, kept, N) int8, of the first problems; p took steps[p] of them
-
-    def summary(self) -> dict[str, float]:
-        """Means over the problems, in the order of the table's columns; NaN if none is solved."""
-
-        def mean_over_solved(cost: np.ndarray) -> float:
-            return float(cost[self.success].mean()) if self.success.any() else float("nan")
-
-        return {
-            "problems": len(self.success),
-            "solved %": 100.0 * float(self.success.mean()),
-            "steps (solved)": mean_over_solved(self.cover_time),
-            f"steps (unsolved = {self.setting.max_cycles})": float(self.steps.mean()),
-            "distance (solved)": mean_over_solved(self.total_distance),
-            "makespan (solved)": mean_over_solved(self.makespan),
-        }
-
-
-def evaluate(
-    policy: Acting, setting: Setting, landmarks: np.ndarray, n_kept: int = 0
-) -> Evaluation:
-    """Let a policy play each problem once.
-
-    Parameters
-    ----------
-    policy
-        Who commands the agents.
-    setting
-        Grid, number of agents and landmarks, step limit.
-    landmarks
-        (P, K) landmark cells, a problem per row.
-    n_kept
-        Of how many problems, the first ones, the joint actions are kept, to be replayed or drawn.
-
-    Raises
-    ------
-    ValueError
-        If there is no problem, or one is not a problem of the grid.
-    """
-    check_count("n_kept", n_kept, 0, 1_000_000)
-    landmarks = np.asarray(landmarks)
-    if landmarks.ndim != 2 or landmarks.shape[0] == 0 or landmarks.shape[1] != setting.n_landmarks:
-        raise ValueError(
-            f"landmarks must be cells of shape (P, {setting.n_landmarks}) with P at least 1, got "
-            f"shape {landmarks.shape}"
-        )
-    n_problems = len(landmarks)
-    n_kept = min(n_kept, n_problems)
-    batch = min(BATCH, n_problems)
-    envs = make_vec(
-        batch,
-        autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
-        grid=setting.grid,
-        n_agents=setting.n_agents,
-        n_landmarks=setting.n_landmarks,
-        max_cycles=setting.max_cycles,
-    )
-    costs = {
-        name: np.full(n_problems, np.inf) for name in ("cover_time", "makespan", "total_distance")
-    }
-    success = np.zeros(n_problems, np.bool_)
-    steps = np.zeros(n_problems, np.int64)
-    kept = np.zeros((setting.max_cycles, n_kept, setting.n_agents), np.int8)
-    for start in range(0, n_problems, batch):
-        # The last batch is filled up with problems played before; they are not read again.
-        rows = np.minimum(np.arange(start, start + batch), n_problems - 1)
-        playing = np.arange(batch) < n_problems - start
-        observations, _ = envs.reset(seed=0, options={"landmarks": landmarks[rows]})
-        step = 0
-        while playing.any():
-            actions = policy.act(observations)
-            if start < n_kept:
-                drawn = playing & (rows < n_kept)
-                kept[step, rows[drawn]] = actions[drawn]
-            observations, _, terminated, truncated, infos = envs.step(actions)
-            step += 1
-            ended = playing & (terminated | truncated)
-            if ended.any():
-                steps[rows[ended]] = step
-                success[rows[ended]] = infos["metrics"]["success"][ended]
-                for name, cost in costs.items():
-                    cost[rows[ended]] = infos["metrics"][name][ended]
-            playing &= ~ended  # what the row plays after its reset is nobody's problem
-    envs.close()
-    return Evaluation(
-        setting=setting,
-        landmarks=landmarks,
-        success=success,
-        steps=steps,
-        **costs,
-        actions=kept,
-    )
-
-
-def unseen_problems(
-    setting: Setting,
-    n_problems: int,
-    seen: Sequence[Sequence[int]] = (),
-    seed: int = EVALUATION_SEED,
-) -> np.ndarray:
-    """Draw distinct problems, none of them in `seen` (in whatever order): (n_problems, K)."""
-    return sample_problems(
-        setting.grid, n_problems, n_landmarks=setting.n_landmarks, seed=seed, exclude=seen
-    )
-
-
-def count_unseen(setting: Setting, seen: Sequence[Sequence[int]]) -> int:
-    """Return how many problems of the setting there are besides those in `seen`."""
-    every = math.comb(setting.grid.reachable.size, setting.n_landmarks)
-    return every - len({tuple(sorted(landmarks)) for landmarks in seen})
-
-
-def format_table(evaluations: dict[str, Evaluation]) -> str:
-    """Return a Markdown table, a row per policy."""
-    names = list(next(iter(evaluations.values())).summary())
-    lines = [["policy", *names]]
-    for label, evaluation in evaluations.items():
-        cells = [_format_cell(name, value) for name, value in evaluation.summary().items()]
-        lines.append([label, *cells])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    rows = [
-        "| "
-        + " | ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        + " |"
-        for line in lines
-    ]
-    ruler = "|" + "|".join("-" * (w + 1) + (":" if c else "-") for c, w in enumerate(widths)) + "|"
-    return "\n".join([rows[0], ruler, *rows[1:]])
-
-
-def _format_cell(name: str, value: float) -> str:
-    if np.isnan(value):
-        return "-"
-    return f"{value:.0f}" if name == "problems" else f"{value:.1f}"
-
-
-def save_table(folder: Path, evaluations: dict[str, Evaluation]) -> None:
-    """Write evaluation.csv (all digits) and evaluation.md (the printed table)."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["policy", *next(iter(evaluations.values())).summary()])
-    for label, evaluation in evaluations.items():
-        writer.writerow([label, *evaluation.summary().values()])
-    write_atomically(folder / "evaluation.csv", text.getvalue().encode())
-    write_atomically(folder / "evaluation.md", (format_table(evaluations) + "\n").encode())
-
-
-# -- from the command line ---------------------------------------------------------------------
 
 
 @dataclass
@@ -219,8 +50,9 @@ class Args:
     policy: str
     """a run folder or a weights file; or "random", or "nearest" (each agent walks a shortest path
     to its nearest unvisited landmark)"""
-    problems: int = 1000
-    """number of distinct problems, none of them a training problem of the run"""
+    problems: int | Literal["universe"] = 1000
+    """number of distinct problems, none of them a training problem of the run; or "universe": all
+    problems of the grid, training problems too"""
     seed: int = EVALUATION_SEED
     """seed of the problems and of everything random in the policy"""
     guidance: float = 0.0
@@ -235,11 +67,14 @@ class Args:
     """number of landmarks, for "random" and "nearest"; a run brings its own"""
     max_cycles: int = 50
     """step limit of an episode, for "random" and "nearest"; a run brings its own"""
+    out: Path | None = None
+    """folder for evaluation.csv and evaluation.md; nothing is written without it"""
     threads: int = 1
     """threads of PyTorch"""
 
     def __post_init__(self) -> None:
-        check_count("problems", self.problems, 1, 1_000_000)
+        if self.problems != "universe":
+            check_count("problems", self.problems, 1, 1_000_000)
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_number("guidance", self.guidance, 0.0, 1.0)
         check_count("threads", self.threads, 1, 1024)
@@ -317,6 +152,12 @@ def check_fits(spec: NetworkSpec, setting: Setting, folder: Path) -> None:
 def main(args: Args) -> None:
     """Evaluate one policy and print the table."""
     torch.set_num_threads(args.threads)
+    if args.out is not None:
+        # Refused before the work, not after it.
+        try:
+            args.out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ValueError(f"out: cannot write into {args.out}: {error}") from error
     rng_policy, rng_guidance = np.random.default_rng(args.seed).spawn(2)
     seen: list[tuple[int, ...]] = []
     policy: Acting
@@ -339,13 +180,48 @@ def main(args: Args) -> None:
         )
         policy = GuidedPolicy(policy, guidance, args.guidance, rng_guidance)
         label += f" + guidance {args.guidance:g}"
+    problems = choose_problems(args, setting, seen)
+    optima = find_optima(setting, problems)
+    evaluation = evaluate(policy, setting, problems, optima, progress=label)
+    print(format_table({label: evaluation}))
+    for line in worst_cases(evaluation):
+        print(line)
+    if args.out is not None:
+        save_table(args.out, {label: evaluation})
+
+
+def choose_problems(args: Args, setting: Setting, seen: list[tuple[int, ...]]) -> np.ndarray:
+    """Return the problems to play, (P, K), and say where they are not what was asked for."""
+    if args.problems == "universe":
+        if seen:
+            print(
+                f"all {count_problems(setting):,} problems of the grid, the {len(seen)} that the "
+                "run was trained on among them\n"
+            )
+        return every_problem(setting)
     n_problems = count_unseen(setting, seen)
     if n_problems < 1:
         raise ValueError("problems: there is none that the run was not trained on")
     if n_problems < args.problems:
         print(f"only {n_problems:,} of {args.problems:,} problems: there are no more unseen ones\n")
-    problems = unseen_problems(setting, min(args.problems, n_problems), seen, args.seed)
-    print(format_table({label: evaluate(policy, setting, problems)}))
+    return unseen_problems(setting, min(args.problems, n_problems), seen, args.seed)
+
+
+def worst_cases(evaluation: Evaluation) -> list[str]:
+    """Return lines that name the first unsolved problem and the first of the largest gap."""
+    lines = []
+    unsolved = ~evaluation.success
+    if unsolved.any():
+        cells = " ".join(map(str, evaluation.landmarks[unsolved.argmax()]))
+        lines.append(f"unsolved: {unsolved.sum():,}, the first with landmarks {cells}")
+    optima = evaluation.optima
+    if optima is not None and not unsolved.all():
+        index = int(np.where(unsolved, -1.0, evaluation.gaps).argmax())
+        lines.append(
+            f"largest gap: landmarks {' '.join(map(str, evaluation.landmarks[index]))}, cover time "
+            f"{evaluation.cover_time[index]:.0f}, optimum {optima.cover_time[index]}"
+        )
+    return lines
 
 
 if __name__ == "__main__":

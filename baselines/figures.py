@@ -22,9 +22,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from baselines.checks import check_count
-from baselines.evaluate import N_ROUTES, Evaluation
+from baselines.evaluation import N_ROUTES, Evaluation
 from baselines.runs import METRICS_FILE, read_metrics
-from mapp_env import Problem, replay
+from mapp_env import Plan, Problem, replay, solve
 from mapp_env.rendering import draw_plan
 
 DPI = 120
@@ -89,22 +89,24 @@ def _draw_curve(
 
 
 def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
-    """Draw Fig. 4: the routes of each evaluation's first two problems, a row per policy.
+    """Draw Fig. 4: the routes of the first two problems, a row each, beside the optimum.
 
     The evaluations must have kept the actions of these. Nothing is chosen by how it came out: the
     problems are the first two of the evaluation, solved or not.
     """
-    n_columns = min(N_ROUTES, *(len(e.landmarks) for e in evaluations.values()))
+    first = next(iter(evaluations.values()))
+    n_rows = min(N_ROUTES, len(first.landmarks))
     for label, evaluation in evaluations.items():
-        if evaluation.actions.shape[1] < n_columns:
+        if evaluation.actions.shape[1] < n_rows:
             raise ValueError(
-                f"evaluations must have kept the actions of {n_columns} problems, {label!r} has "
+                f"evaluations must have kept the actions of {n_rows} problems, {label!r} has "
                 f"those of {evaluation.actions.shape[1]}"
             )
+    n_columns = len(evaluations) + 1
     figure, grid_of_axes = plt.subplots(
-        len(evaluations),
+        n_rows,
         n_columns,
-        figsize=(PANEL_WIDTH * n_columns, PANEL_HEIGHT * len(evaluations)),
+        figsize=(PANEL_WIDTH * n_columns, PANEL_HEIGHT * n_rows),
         squeeze=False,
     )
     # By hand: layout engines shrink a square map to make room for the legend below it.
@@ -112,26 +114,32 @@ def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
         left=0.02,
         right=0.98,
         wspace=0.02,
-        top=1 - 0.55 / (PANEL_HEIGHT * len(evaluations)),
-        bottom=0.8 / (PANEL_HEIGHT * len(evaluations)),
+        top=1 - 0.55 / (PANEL_HEIGHT * n_rows),
+        bottom=0.8 / (PANEL_HEIGHT * n_rows),
         hspace=1.35 / (PANEL_HEIGHT - 1.35),
     )
-    for row, (label, evaluation) in zip(grid_of_axes, evaluations.items(), strict=True):
-        for index, axes in enumerate(row):
-            problem = Problem(
-                evaluation.setting.grid,
-                tuple(evaluation.landmarks[index].tolist()),
-                evaluation.setting.n_agents,
-                evaluation.setting.max_cycles,
-            )
-            plan = replay(problem, evaluation.actions[: evaluation.steps[index], index])
-            n_visited = sum(len(claims) for claims in plan.claims)
-            if plan.success:
-                outcome = f"all visited in {plan.cover_time} steps, distance {plan.total_distance}"
-            else:
-                outcome = f"not solved: {n_visited} of {len(problem.landmarks)} visited"
-            draw_plan(problem, plan, ax=axes, title=f"({'ab'[index]}) {label}\n{outcome}")
+    for index, row in enumerate(grid_of_axes):
+        setting = first.setting
+        landmarks = tuple(first.landmarks[index].tolist())
+        problem = Problem(setting.grid, landmarks, setting.n_agents, setting.max_cycles)
+        plans = {
+            label: replay(problem, evaluation.actions[: evaluation.steps[index], index])
+            for label, evaluation in evaluations.items()
+        }
+        best = solve(problem)
+        plans["optimum" if best.status == "optimal" else "best known"] = best
+        for axes, (label, plan) in zip(row, plans.items(), strict=True):
+            title = f"({'ab'[index]}) {label}\n{_outcome(problem, plan)}"
+            draw_plan(problem, plan, ax=axes, title=title)
     return _save(figure, path)
+
+
+def _outcome(problem: Problem, plan: Plan) -> str:
+    """Say in a line what became of a problem."""
+    if plan.success:
+        return f"all visited in {plan.cover_time} steps, distance {plan.total_distance}"
+    n_visited = sum(len(claims) for claims in plan.claims)
+    return f"not solved: {n_visited} of {len(problem.landmarks)} visited"
 
 
 def _save(figure: Figure, path: Path) -> Path:

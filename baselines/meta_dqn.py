@@ -29,15 +29,15 @@ from torch import Tensor, nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.checks import check_choice, check_count, check_number
-from baselines.evaluate import (
+from baselines.evaluate import N_ACTIONS, find_grid
+from baselines.evaluation import (
     EVALUATION_SEED,
-    N_ACTIONS,
     N_ROUTES,
     Evaluation,
     Setting,
     count_unseen,
     evaluate,
-    find_grid,
+    find_optima,
     format_table,
     save_table,
     unseen_problems,
@@ -409,8 +409,9 @@ def evaluate_training(
         policies["nearest landmark"] = NearestLandmarkPolicy(grid, args.n_agents, args.n_landmarks)
     else:
         print(f"no row for the nearest landmark: the grid has more than {MAX_TABLE_CELLS:,} cells")
+    optima = find_optima(setting, problems)
     return {
-        label: evaluate(policy, setting, problems, n_kept=N_ROUTES)
+        label: evaluate(policy, setting, problems, optima, n_kept=N_ROUTES, progress=label)
         for label, policy in policies.items()
     }
 

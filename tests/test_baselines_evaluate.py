@@ -1,19 +1,25 @@
 """Evaluation: the figures are those of the rules, on problems never trained on."""
 
+import dataclasses
+import itertools
+
 import numpy as np
 import pytest
 
-from baselines import evaluate as evaluation_module
-from baselines.evaluate import (
+from baselines import evaluate as script
+from baselines import evaluation as evaluation_module
+from baselines.evaluation import (
     Setting,
     count_unseen,
     evaluate,
+    every_problem,
+    find_optima,
     format_table,
     save_table,
     unseen_problems,
 )
 from baselines.policy import NearestLandmarkPolicy, RandomPolicy
-from mapp_env import Grid, Problem, make_grid, replay
+from mapp_env import Grid, Problem, make_grid, replay, solve
 
 PAPER = Setting(make_grid("paper-7x7"))
 WIDE = Setting(Grid.from_text("D......#\n.##.#...\n...#...."), 2, 3, 30)
@@ -46,9 +52,9 @@ def test_nearest_landmark_solves_everything_and_chance_does_not():
     problems = unseen_problems(PAPER, 500)
     chance, nearest = (evaluate(policy, PAPER, problems).summary() for policy in rivals(PAPER))
     assert nearest["solved %"] == 100.0
-    assert nearest["steps (solved)"] == nearest["steps (unsolved = 50)"]
+    assert nearest["cover time"] == nearest["unsolved = 50"]
     assert 5.0 < chance["solved %"] < 25.0
-    assert chance["steps (solved)"] < chance["steps (unsolved = 50)"]
+    assert chance["cover time"] < chance["unsolved = 50"]
 
 
 def test_size_of_the_batch_changes_nothing(monkeypatch):
@@ -92,11 +98,11 @@ def test_table_says_when_nothing_was_solved(tmp_path):
     result = evaluate(rivals(setting)[1], setting, unseen_problems(setting, 10))
     table = format_table({"one step": result})
     cells = [cell.strip() for cell in table.splitlines()[-1].split("|")[1:-1]]
-    assert cells == ["one step", "10", "0.0", "-", "1.0", "-", "-"]
+    assert cells == ["one step", "10", "0.00", "-", "-", "-", "-", "1.00", "-", "-"]
     save_table(tmp_path, {"one step": result})
     assert (tmp_path / "evaluation.md").read_text() == table + "\n"
     header, row = (tmp_path / "evaluation.csv").read_text().splitlines()
-    assert len(header.split(",")) == len(row.split(",")) == 7
+    assert len(header.split(",")) == len(row.split(",")) == 10
 
 
 def test_only_the_actions_asked_for_are_kept():
@@ -110,3 +116,116 @@ def test_only_the_actions_asked_for_are_kept():
     assert evaluate(nearest, PAPER, problems[:3], n_kept=5).actions.shape == (50, 3, 3)
     with pytest.raises(ValueError, match=r"n_kept must be .* got -1"):
         evaluate(nearest, PAPER, problems, n_kept=-1)
+
+
+class Walking:
+    """Walks the optimal plan of each problem, but for some, where it waits a step at first."""
+
+    def __init__(self, setting: Setting, landmarks: np.ndarray, late: set[int]) -> None:
+        self.plans = {}
+        for index, row in enumerate(landmarks.tolist()):
+            problem = Problem(setting.grid, row, setting.n_agents)
+            actions = solve(problem).joint_actions()
+            # Into the border, from a depot in the corner.
+            bump = np.zeros((1, setting.n_agents), actions.dtype)
+            self.plans[tuple(row)] = np.concatenate((bump, actions)) if index in late else actions
+        self.n_agents, self.n_landmarks = setting.n_agents, setting.n_landmarks
+        self.steps: dict[tuple[int, ...], int] = {}
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Return the next joint action of each row's problem."""
+        actions = np.empty((len(observations), self.n_agents), int)
+        for row, observation in enumerate(observations.astype(int)):
+            key = tuple(observation[self.n_agents : self.n_agents + self.n_landmarks].tolist())
+            step = self.steps.get(key, 0)
+            actions[row] = self.plans[key][step]
+            self.steps[key] = step + 1
+        return actions
+
+
+def test_gaps_are_to_the_optimum():
+    """A policy that walks optimal plans has no gap, and one step late exactly that step's share."""
+    problems = unseen_problems(WIDE, 20)
+    optima = find_optima(WIDE, problems)
+    late = {3, 11}
+    result = evaluate(Walking(WIDE, problems, late), WIDE, problems, optima)
+    expected = [1 / optima.cover_time[index] if index in late else 0.0 for index in range(20)]
+    np.testing.assert_allclose(result.gaps, expected)
+    summary = result.summary()
+    assert summary["gap %"] == pytest.approx(100 * np.mean(expected))
+    assert summary["worst gap %"] == pytest.approx(100 * max(expected))
+    assert summary["optimal %"] == 90.0
+    assert summary["cover time"] == pytest.approx(optima.cover_time.mean() + 0.1)
+    table = format_table({"late": result}).splitlines()
+    assert len(table) == 4
+    assert table[-1].startswith("| optimum of each cost |")
+
+
+@pytest.mark.parametrize("n_landmarks", [3, 13])
+def test_optima_are_those_of_solve(n_landmarks):
+    """In each objective, by the batch of small problems and by one problem after the other."""
+    setting = dataclasses.replace(WIDE, n_landmarks=n_landmarks)
+    problems = unseen_problems(setting, 8)
+    optima = find_optima(setting, problems)
+    for objective in ("cover_time", "makespan", "total_distance"):
+        costs = [
+            solve(Problem(setting.grid, row, setting.n_agents), objective, "exact").cost
+            for row in problems.tolist()
+        ]
+        assert getattr(optima, objective).tolist() == costs
+
+
+def test_no_optima_no_gaps():
+    """Beyond the exact solver's reach gaps are dashes, and there is no row of the optimum."""
+    setting = Setting(Grid(np.zeros((6, 6), np.bool_)), 2, 21, 3)
+    problems = unseen_problems(setting, 2)
+    assert find_optima(setting, problems) is None
+    result = evaluate(rivals(setting)[1], setting, problems)
+    assert np.isnan(
+        [result.summary()[name] for name in ("gap %", "optimal %", "worst gap %")]
+    ).all()
+    assert len(format_table({"nearest": result}).splitlines()) == 3
+
+
+def test_cost_below_the_optimum_is_an_error():
+    """An evaluation that beats a proven optimum cannot be true, and is not built."""
+    problems = unseen_problems(PAPER, 30)
+    optima = find_optima(PAPER, problems)
+    result = evaluate(rivals(PAPER)[1], PAPER, problems, optima)
+    costs = result.makespan.copy()
+    costs[7] = optima.makespan[7] - 1
+    with pytest.raises(RuntimeError, match="a makespan below the proven optimum"):
+        dataclasses.replace(result, makespan=costs)
+
+
+def test_universe_is_every_problem(tmp_path, capsys):
+    """`--problems universe` plays each set of landmarks once, and writes the table if asked to."""
+    (tmp_path / "tiny.txt").write_text("D....\n.....")
+    setting = Setting(Grid.load(tmp_path / "tiny.txt"), 1, 2, 20)
+    sets = list(itertools.combinations(range(1, 10), 2))
+    assert every_problem(setting).tolist() == [list(cells) for cells in sets]
+    options = {"grid": str(tmp_path / "tiny.txt"), "n_agents": 1, "n_landmarks": 2}
+    folder = tmp_path / "new" / "table"
+    script.main(script.Args("nearest", "universe", out=folder, **options))
+    printed, errors = capsys.readouterr()
+    table = (folder / "evaluation.md").read_text()
+    assert printed.startswith(table)
+    assert "| nearest              |       36 |" in table
+    assert "largest gap: landmarks" in printed
+    assert errors == ""  # no bar where there is no terminal
+
+
+def test_universe_too_large_is_refused_before_playing():
+    """A universe of billions is refused by number; so is a folder that cannot be made."""
+    with pytest.raises(
+        ValueError, match=r"this grid has 3,838,380 problems of 6 landmarks|at most"
+    ):
+        script.main(script.Args("random", "universe", n_landmarks=12))
+    with pytest.raises(ValueError, match="out: cannot write into /dev/null/x"):
+        script.main(script.Args("random", 3, out=script.Path("/dev/null/x")))
+
+
+def test_shares_are_never_rounded_up_to_all():
+    """One problem unsolved in a hundred thousand does not show as 100 %."""
+    assert evaluation_module._format_cell("solved %", 99.9999) == "99.99"
+    assert evaluation_module._format_cell("optimal %", 100.0) == "100.00"

@@ -26,9 +26,9 @@ from mapp_env.dynamics import (
 )
 from mapp_env.solvers import exact as exact_module
 from mapp_env.solvers import solve_universe
+from mapp_env.solvers.batch import least_worst
 from mapp_env.solvers.bounds import landmark_distances, lower_bound
 from mapp_env.solvers.exact import route_costs, shortest_routes
-from mapp_env.solvers.universe import least_worst
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 SHAPES = ((7, 7), (1, 9), (12, 1), (2, 5), (5, 3), (4, 11), (3, 3), (9, 6), (2, 2), (10, 10))

@@ -10,6 +10,7 @@ import numpy as np
 
 from mapp_env.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
+from mapp_env.solvers.batch import optimal_costs
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.solution import Routes, Solution, Solver
 from mapp_env.solvers.universe import solve_universe
@@ -17,7 +18,7 @@ from mapp_env.solvers.vrplib import save_vrplib
 from mapp_env.validation import MAX_SEED, check_choice, check_count, describe
 from mapp_env.walking import tour_through, walk_tours
 
-__all__ = ["METHODS", "Solution", "save_vrplib", "solve", "solve_universe"]
+__all__ = ["METHODS", "Solution", "optimal_costs", "save_vrplib", "solve", "solve_universe"]
 
 METHODS = ("auto", "exact", "search", "pyvrp")
 

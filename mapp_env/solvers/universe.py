@@ -12,23 +12,17 @@ from mapp_env.compiled import kernel
 from mapp_env.grid import Grid
 from mapp_env.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
+from mapp_env.solvers.batch import CHUNK_WORK, MAX_BATCH_LANDMARKS, Workspace, solve_rows
 from mapp_env.solvers.bounds import cell_distances
-from mapp_env.solvers.exact import route_costs, shortest_routes
 from mapp_env.validation import check_choice, check_count
 
-__all__ = ["MAX_UNIVERSE_LANDMARKS", "MAX_UNIVERSE_PROBLEMS", "MAX_UNIVERSE_WORK", "solve_universe"]
+__all__ = ["MAX_UNIVERSE_PROBLEMS", "MAX_UNIVERSE_WORK", "solve_universe"]
 
 MAX_UNIVERSE_PROBLEMS = 10_000_000
 """Largest number of problems: up to half a gigabyte of answers."""
 
-MAX_UNIVERSE_LANDMARKS = 12
-"""Largest number of landmarks of each."""
-
 MAX_UNIVERSE_WORK = 20_000_000_000
 """Largest number of problems times ``3 ** n_landmarks``: some minutes."""
-
-CHUNK_WORK = 4_000_000  # between two chances to interrupt: some milliseconds
-FAR = np.int32(1 << 29)
 
 
 def solve_universe(
@@ -63,7 +57,7 @@ def solve_universe(
         the message says how many, and nothing has been allocated.
     """
     check_grid("grid", grid)
-    check_count("n_landmarks", n_landmarks, 1, MAX_UNIVERSE_LANDMARKS)
+    check_count("n_landmarks", n_landmarks, 1, MAX_BATCH_LANDMARKS)
     check_count("n_agents", n_agents, 1, MAX_AGENTS)
     check_choice("objective", objective, OBJECTIVES)
     cells = grid.reachable
@@ -88,116 +82,41 @@ def solve_universe(
     teams = 1 if objective == "total_distance" else min(n_agents, n_landmarks)
     landmarks = np.empty((n_problems, n_landmarks), cell_type)
     optimum = np.empty(n_problems, np.int32)
-    size = 1 << n_landmarks
+    workspace = Workspace.of(n_landmarks)
     chosen = np.arange(n_landmarks)
-    scratch = (
-        np.empty((n_landmarks + 1, n_landmarks + 1), np.int32),
-        np.empty((size, n_landmarks), np.int32),
-        np.empty(size, np.int32),
-        np.empty((2, size // 2), np.int32),
-    )
     chunk = max(1, CHUNK_WORK // 3**n_landmarks)
+    ranks = np.empty((min(chunk, n_problems), n_landmarks), np.int32)
     for first in range(0, n_problems, chunk):
-        part = slice(first, first + chunk)
-        solve_next(
-            distances, cells, chosen, teams, closed, landmarks[part], optimum[part], *scratch
-        )
+        part = ranks[: n_problems - first]
+        list_sets(chosen, len(cells), part)
+        landmarks[first : first + chunk] = cells[part]
+        solve_rows(distances, part + 1, teams, closed, optimum[first : first + chunk], workspace)
     return landmarks, optimum
 
 
 @kernel
-def solve_next(
-    distances: NDArray[np.int32],
-    cells: NDArray[np.int32],
-    chosen: NDArray[np.int64],
-    teams: int,
-    closed: bool,
-    landmarks: NDArray[Any],
-    optimum: NDArray[np.int32],
-    between: NDArray[np.int32],
-    routes: NDArray[np.int32],
-    costs: NDArray[np.int32],
-    worst: NDArray[np.int32],
-) -> None:
-    """Solve some problems, in lexicographic order from ``chosen`` on.
+def list_sets(chosen: NDArray[np.int64], n_items: int, sets: NDArray[np.int32]) -> None:
+    """Write sets of items in lexicographic order, from ``chosen`` on.
 
     Parameters
     ----------
-    distances : ndarray of int32, shape (F + 1, F + 1)
-        Between the depot and the cells that may hold a landmark.
-    cells : ndarray of int32, shape (F,)
-        Those cells.
     chosen : ndarray of int64, shape (K,)
-        The first set, as ascending positions in ``cells``; left as the one after the last.
-    teams : int
-        Number of agents.
-    closed : bool
-        Whether tours are closed.
-    landmarks, optimum : ndarray, shape (p, K) and (p,)
-        The results.
-    between, routes, costs, worst : ndarray of int32
-        Scratch space: (K + 1, K + 1), (2 ** K, K), (2 ** K,), (2, 2 ** (K - 1)).
+        The first set, ascending; left as the one after the last, if there is one.
+    n_items : int
+        Items are 0 to ``n_items - 1``.
+    sets : ndarray of int32, shape (p, K)
+        The result.
     """
-    n_landmarks = chosen.shape[0]
-    for problem in range(optimum.shape[0]):
-        between[0, 0] = 0
-        for a in range(n_landmarks):
-            landmarks[problem, a] = cells[chosen[a]]
-            between[0, a + 1] = between[a + 1, 0] = distances[0, chosen[a] + 1]
-            for b in range(n_landmarks):
-                between[a + 1, b + 1] = distances[chosen[a] + 1, chosen[b] + 1]
-        shortest_routes(between, routes)
-        route_costs(between, routes, closed, costs)
-        optimum[problem] = least_worst(costs, teams, worst)
-        place = n_landmarks - 1
-        last = cells.shape[0] - n_landmarks
+    n_chosen = chosen.shape[0]
+    last = n_items - n_chosen
+    for row in range(sets.shape[0]):
+        for place in range(n_chosen):
+            sets[row, place] = chosen[place]
+        place = n_chosen - 1
         while place >= 0 and chosen[place] == last + place:
             place -= 1
         if place < 0:
             return
         chosen[place] += 1
-        for after in range(place + 1, n_landmarks):
+        for after in range(place + 1, n_chosen):
             chosen[after] = chosen[after - 1] + 1
-
-
-@kernel
-def least_worst(costs: NDArray[np.int32], teams: int, worst: NDArray[np.int32]) -> int:
-    """Return the smallest possible cost of the costliest of so many sets that hold everything.
-
-    Parameters
-    ----------
-    costs : ndarray of int32, shape (2 ** K,)
-        What each set costs one agent.
-    teams : int
-        Number of agents.
-    worst : ndarray of int32, shape (2, 2 ** (K - 1))
-        Scratch space: the answer for fewer agents and each set without the highest landmark.
-    """
-    half = worst.shape[1]
-    if teams == 1:
-        return int(costs[-1])
-    fewer = 0
-    for left in range(half):
-        worst[0, left] = costs[left]
-    for _ in range(2, teams):
-        more = 1 - fewer
-        worst[more, 0] = 0
-        top = 1
-        for left in range(1, half):
-            if left == 2 * top:
-                top = left
-            # One agent visits the highest landmark, and any of the others.
-            others = left ^ top
-            least = FAR
-            part = others
-            while True:
-                least = min(least, max(costs[top | part], worst[fewer, others ^ part]))
-                if part == 0:
-                    break
-                part = (part - 1) & others
-            worst[more, left] = least
-        fewer = more
-    least = FAR
-    for part in range(half):
-        least = min(least, max(costs[half | part], worst[fewer, (half - 1) ^ part]))
-    return int(least)
