@@ -1,0 +1,274 @@
+"""What the best possible policy for a reward achieves: the ceiling of whoever trains on it.
+
+Method: value iteration over all states of a problem (cells of the agents x unvisited landmarks),
+without any learning; then the cover time of the policy that is optimal for the discounted reward,
+beside the optimal cover time. Joint actions of equal value are ties: the figures are those of
+breaking them at random, and at their best and worst.
+
+Command::
+
+    python baselines/reward_ceiling.py --problems 200
+
+Output: a table with a row per reward: share of problems solved within the step limit, mean gap of
+the cover time, share of problems whose cover time is optimal, largest gap. Solved, optimal and
+largest are for ties broken at their worst.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from baselines.checks import check_choice, check_count, check_number
+from baselines.evaluate import find_grid
+from baselines.evaluation import EVALUATION_SEED, Setting, find_optima, unseen_problems
+from mapp_env import Grid
+
+REWARDS = ("manhattan", "geodesic", "step")
+N_ACTIONS = 4
+MAX_STATES = 2**26  # half a gigabyte of values
+SAME = 1e-9  # values closer than this are a tie
+WORST = -1e9  # below any discounted sum of rewards
+
+
+# -- values ------------------------------------------------------------------------------------
+
+
+class RewardModel:
+    """All states of one problem of a small grid, under one reward.
+
+    A state is a tuple of the agents' places (numbers of cells that can be reached) and a set of
+    unvisited landmarks (bits). Arrays over the places have one axis per agent.
+    """
+
+    def __init__(self, setting: Setting, landmarks: Sequence[int], reward: str) -> None:
+        grid = setting.grid
+        cells = np.sort(np.append(grid.reachable, grid.depot))
+        place_of = np.full(grid.n_cells, -1)
+        place_of[cells] = np.arange(len(cells))
+        self.n_agents, self.n_landmarks = setting.n_agents, len(landmarks)
+        self.moves = place_of[np.asarray(grid.moves)[cells, :N_ACTIONS]]  # (places, 4)
+        self.depot = int(place_of[grid.depot])
+        self.shape = (len(cells),) * self.n_agents
+        to_landmark = distances_to(grid, landmarks, reward)[:, cells]  # (K, places)
+        # Per landmark, over the places: whether an agent stands on it, the distance of the nearest.
+        on = [cells == landmark for landmark in landmarks]
+        self.visited = [self._over_agents(np.logical_or, mask) for mask in on]
+        self.nearest = [self._over_agents(np.minimum, steps) for steps in to_landmark]
+
+    def _over_agents(self, combine: np.ufunc, line: np.ndarray) -> np.ndarray:
+        """Combine one value per agent's place into an array over all agents' places."""
+        whole = line
+        for _ in range(self.n_agents - 1):
+            whole = combine(whole[..., None], line)
+        return whole
+
+    def rewards(self, unvisited: int, reward: str) -> np.ndarray:
+        """Return the reward (R6) for having moved to each places; the set is that of before."""
+        left = [k for k in range(self.n_landmarks) if unvisited >> k & 1]
+        if reward == "step":
+            return np.logical_and.reduce([self.visited[k] for k in left]) - 1.0
+        # A landmark under an agent is at distance 0, so it drops out by itself.
+        return -np.sum([self.nearest[k] for k in left], axis=0, dtype=np.float64)
+
+    def best_neighbour(self, values: np.ndarray) -> np.ndarray:
+        """Return the largest value that one joint action leads to, for all places."""
+        for axis in range(self.n_agents):
+            values = np.maximum.reduce(
+                [values.take(self.moves[:, action], axis) for action in range(N_ACTIONS)]
+            )
+        return values
+
+
+@dataclass(frozen=True)
+class Solved:
+    """The optimal values of one problem under one reward."""
+
+    model: RewardModel
+    arrival: list[np.ndarray]  # per set: value of moving to places, the reward included
+
+
+def iterate_values(model: RewardModel, reward: str, discount: float) -> Solved:
+    """Return the optimal values: one set of unvisited landmarks after another, smaller ones first.
+
+    With a landmark under an agent the set is in truth a smaller one, whose values are known; the
+    other places are iterated until nothing moves.
+    """
+    values = [np.zeros(model.shape)]  # by set; nothing is left to lose when all are visited
+    arrival = [np.zeros(model.shape)]
+    for unvisited in range(1, 1 << model.n_landmarks):
+        value = np.full(model.shape, WORST)
+        for k in range(model.n_landmarks):
+            if unvisited >> k & 1:
+                value = np.where(model.visited[k], values[unvisited ^ (1 << k)], value)
+        open_places = value == WORST
+        rewards = model.rewards(unvisited, reward)
+        while True:
+            arriving = rewards + discount * value
+            new = np.where(open_places, model.best_neighbour(arriving), value)
+            settled = np.abs(new - value).max() <= SAME
+            value = new
+            if settled:
+                break
+        values.append(value)
+        arrival.append(rewards + discount * value)
+    return Solved(model, arrival)
+
+
+def distances_to(grid: Grid, landmarks: Sequence[int], reward: str) -> np.ndarray:
+    """Return what the reward calls a distance from each landmark to each cell: (K, C)."""
+    if reward == "geodesic":
+        return np.asarray(grid.distances_from(landmarks))
+    rows, cols = np.divmod(np.arange(grid.n_cells), grid.cols)
+    return np.array([abs(rows - rows[cell]) + abs(cols - cols[cell]) for cell in landmarks])
+
+
+# -- the policy that is optimal for them -------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CoverTimes:
+    """Cover times of the policies that are optimal for a reward; infinite beyond the limit."""
+
+    at_random: float  # mean over ties broken at random
+    best: float
+    worst: float
+
+
+def cover_times(solved: Solved, max_cycles: int) -> CoverTimes:
+    """Follow all optimal joint actions from the depot, each with its probability."""
+    model = solved.model
+    everything = (1 << model.n_landmarks) - 1
+    now = {((model.depot,) * model.n_agents, everything): 1.0}
+    best, mean = math.inf, 0.0
+    for step in range(1, max_cycles + 1):
+        after: dict[tuple[tuple[int, ...], int], float] = {}
+        for (places, unvisited), chance in now.items():
+            ties = optimal_moves(solved, places, unvisited)
+            for target in ties:
+                key = (target, left_after(model, target, unvisited))
+                after[key] = after.get(key, 0.0) + chance / len(ties)
+        finished = sum(chance for (_, left), chance in after.items() if left == 0)
+        if finished:
+            best = min(best, step)
+            mean += step * finished
+        now = {key: chance for key, chance in after.items() if key[1]}
+        if not now:
+            return CoverTimes(mean, best, step)
+    return CoverTimes(math.inf, best, math.inf)
+
+
+def optimal_moves(solved: Solved, places: tuple[int, ...], unvisited: int) -> list[tuple[int, ...]]:
+    """Return the places that each optimal joint action leads to; two actions may agree."""
+    block = solved.arrival[unvisited][np.ix_(*(solved.model.moves[place] for place in places))]
+    chosen = np.argwhere(block >= block.max() - SAME).tolist()
+    moves = solved.model.moves
+    return [
+        tuple(int(moves[place, action]) for place, action in zip(places, actions, strict=True))
+        for actions in chosen
+    ]
+
+
+def left_after(model: RewardModel, places: tuple[int, ...], unvisited: int) -> int:
+    """Return the landmarks still unvisited after moving to places."""
+    for k in range(model.n_landmarks):
+        if model.visited[k][places]:
+            unvisited &= ~(1 << k)
+    return unvisited
+
+
+# -- from the command line ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Args:
+    """Options of the study."""
+
+    rewards: tuple[str, ...] = REWARDS
+    """which rewards (rule R6)"""
+    discount: float = 0.95
+    """discount factor of future rewards; the paper's is 0.95"""
+    problems: int = 100
+    """number of random problems: one takes about a second for each reward"""
+    seed: int = EVALUATION_SEED
+    """seed of the problems"""
+    grid: str = "paper-7x7"
+    """bundled grid or map file"""
+    n_agents: int = 3
+    """number of agents"""
+    n_landmarks: int = 5
+    """number of landmarks in each problem"""
+    max_cycles: int = 50
+    """steps after which a problem counts as unsolved"""
+
+    def __post_init__(self) -> None:
+        for reward in self.rewards:
+            check_choice("rewards", reward, REWARDS)
+        check_number("discount", self.discount, 0.0, 1.0)
+        check_count("problems", self.problems, 1, 1_000_000)
+        check_count("seed", self.seed, 0, 2**63 - 1)
+        check_count("n_agents", self.n_agents, 1, 16)
+        check_count("n_landmarks", self.n_landmarks, 1, 64)
+        check_count("max_cycles", self.max_cycles, 1, 1_000_000)
+
+
+def study(
+    setting: Setting, landmarks: Iterable[Sequence[int]], reward: str, discount: float
+) -> list[CoverTimes]:
+    """Return the cover times of each problem."""
+    found = []
+    for row in landmarks:
+        model = RewardModel(setting, row, reward)
+        found.append(cover_times(iterate_values(model, reward, discount), setting.max_cycles))
+    return found
+
+
+def format_row(label: str, found: list[CoverTimes], optimum: np.ndarray) -> str:
+    """Return one line of the table."""
+    mean, best, worst = (
+        np.array([getattr(times, name) for times in found])
+        for name in ("at_random", "best", "worst")
+    )
+    solved = np.isfinite(worst)
+    if not solved.any():
+        return f"| {label:<9} | {0:8.2f} | {'-':>6} | {'-':>17} | {0:9.1f} | {'-':>11} |"
+    gap, low, high = (
+        100 * float((times[solved] / optimum[solved] - 1).mean()) for times in (mean, best, worst)
+    )
+    largest = 100 * float((worst[solved] / optimum[solved] - 1).max())
+    share = 100 * float((worst == optimum).mean())
+    return (
+        f"| {label:<9} | {100 * solved.mean():8.2f} | {gap:6.2f} | {f'{low:.2f} - {high:.2f}':>17} "
+        f"| {share:9.1f} | {largest:11.1f} |"
+    )
+
+
+def main(args: Args) -> None:
+    """Print the table."""
+    setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
+    n_states = (setting.grid.reachable.size + 1) ** args.n_agents << args.n_landmarks
+    if n_states > MAX_STATES:
+        raise ValueError(
+            f"grid, n_agents and n_landmarks make {n_states:,} states, allowed are {MAX_STATES:,}"
+        )
+    landmarks = unseen_problems(setting, args.problems, seed=args.seed)
+    optima = find_optima(setting, landmarks)
+    if optima is None:
+        raise ValueError("n_landmarks must be at most 20 for a proven optimum")
+    print(f"{args.problems:,} problems, discount {args.discount:g}\n")
+    print("| reward    | solved % |  gap % |  best - worst tie | optimal % | worst gap % |")
+    print("|-----------|---------:|-------:|------------------:|----------:|------------:|")
+    for reward in args.rewards:
+        rows = tqdm(landmarks.tolist(), desc=reward, leave=False, disable=None)
+        found = study(setting, rows, reward, args.discount)
+        print(format_row(reward, found, optima.cover_time), flush=True)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from error
