@@ -26,7 +26,7 @@ import numpy as np
 
 from mapp_env import Grid, Problem, make_grid
 from mapp_env.plan import OBJECTIVES
-from mapp_env.solvers.bounds import cell_distances
+from mapp_env.solvers.distances import cell_distances
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.search import Search
 

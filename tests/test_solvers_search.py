@@ -14,7 +14,8 @@ import pytest
 
 from mapp_env import Grid, Problem, make_grid, sample_problems, solve
 from mapp_env.solvers import search as search_module
-from mapp_env.solvers.bounds import landmark_distances, lower_bound
+from mapp_env.solvers.bounds import lower_bound
+from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
 from mapp_env.solvers.search import Search, solve_search
@@ -186,6 +187,13 @@ def test_search_ends_at_the_bound() -> None:
     found = solve_search(problem, "cover_time", time_limit=30)
     assert found.optimal
     assert time.perf_counter() - start < 15
+
+
+def test_search_proves_small_optima() -> None:
+    """Five landmarks of the default grid: what the search finds is proven, and at once."""
+    problem = Problem(make_grid(), (0, 6, 20, 42, 48), 3)
+    plan = solve(problem, method="search")
+    assert (plan.cost, plan.status, plan.bound) == (12, "optimal", 12)
 
 
 def test_search_without_limits_ends() -> None:

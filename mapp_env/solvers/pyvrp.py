@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from mapp_env.plan import OBJECTIVES
 from mapp_env.problem import Problem
-from mapp_env.solvers.bounds import landmark_distances, lower_bound
+from mapp_env.solvers.bounds import lower_bound
+from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.solution import Routes, Solution
 from mapp_env.validation import check_choice
 

@@ -12,8 +12,8 @@ from mapp_env.compiled import kernel
 from mapp_env.grid import Grid
 from mapp_env.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
-from mapp_env.solvers.bounds import cell_distances
-from mapp_env.solvers.exact import route_costs, shortest_routes
+from mapp_env.solvers.distances import cell_distances
+from mapp_env.solvers.held_karp import route_costs, shortest_routes
 from mapp_env.validation import check_choice, check_count
 
 __all__ = ["MAX_UNIVERSE_LANDMARKS", "MAX_UNIVERSE_PROBLEMS", "MAX_UNIVERSE_WORK", "solve_universe"]
