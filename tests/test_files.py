@@ -339,7 +339,7 @@ def test_a_broken_plan_is_not_saved(tmp_path: Path) -> None:
 def test_vrplib_is_read_by_an_independent_reader(tmp_path: Path) -> None:
     """The vrplib package reads the matrix, the demands and the depot that were written."""
     rng = np.random.default_rng(4)
-    for n_landmarks in (1, 2, 17, 64):
+    for n_landmarks in (1, 2, 17, 256):
         walls = rng.random((20, 30)) < 0.2
         walls[10, 15] = False
         grid = Grid(walls, (10, 15))
