@@ -333,6 +333,19 @@ def test_a_broken_plan_is_not_saved(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_plan_by_hand_is_saved_as_played(tmp_path: Path) -> None:
+    """Without actions, and with NumPy's integers, a plan is saved; it loads with its actions."""
+    tours = (tuple(np.array([24, 25, 24])), ())
+    by_hand = Plan(
+        tours, ((np.int64(25),), ()), 1, 2, 2, problem=Problem(make_grid(), (25,), 2), bound=1
+    )
+    by_hand.save(tmp_path / "plan.json")
+    loaded = Plan.load(tmp_path / "plan.json")
+    assert (loaded.tours, loaded.claims, loaded.bound) == (by_hand.tours, by_hand.claims, 1)
+    assert loaded.claim_steps == ((1,), ())
+    assert replay(by_hand.problem, loaded.joint_actions()).tours == tours
+
+
 # -- distances for other solvers -----------------------------------------
 
 

@@ -543,7 +543,7 @@ def test_solve_refuses_bad_arguments() -> None:
         solve(problem, "distance")
     with pytest.raises(ValueError, match="method must be one of"):
         solve(problem, method="magic")
-    for limit in (0, -1, math.nan, math.inf, True, "1"):
+    for limit in (0, -1, math.nan, math.inf, True, "1", 10**400, 1j, np.complex128(1)):
         with pytest.raises(ValueError, match="time_limit must be"):
             solve(problem, time_limit=limit)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="seed must be"):

@@ -180,6 +180,19 @@ def test_search_keeps_to_its_time() -> None:
     assert 0.3 <= seconds < 1.5
 
 
+@pytest.mark.parametrize("kind", ["random", "maze"])
+def test_the_largest_grids_take_little_longer(kind: str) -> None:
+    """On 512 x 512 cells distances and tours are not in the time limit, but they take no second."""
+    grid = make_grid(kind, rows=512, cols=512, seed=1)
+    problem = Problem(grid, sample_problems(grid, 1, 64, 3)[0].tolist(), 5)
+    solve(problem, method="search", time_limit=0.01)
+    start = time.process_time()
+    for objective in OBJECTIVES:
+        plan = solve(problem, objective, method="search", time_limit=0.05)
+        assert plan.cost < 10**9
+    assert time.process_time() - start < 6
+
+
 def test_search_ends_at_the_bound() -> None:
     """Where the bound is met the search ends long before its time."""
     problem = generated_problem("random", 32, 20, 16, 0)

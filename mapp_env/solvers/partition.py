@@ -33,7 +33,7 @@ def split(tours: NDArray[np.int32], families: Families, teams: int) -> list[int]
         # With no limit on the agents one table does, which fills itself in; mostly it needs few.
         sums = np.empty(half, np.int32)
         add_agent(tours, sums, np.ones(half, np.bool_), sums)
-        parts = _trace_parts(tours, [sums] * len(tours))
+        parts = _trace_parts(tours, [sums] * len(tours).bit_length())
         if len(parts) <= teams:
             return parts
     # tables[n][S]: the least sum for n agents and S, where they can visit S and the other agents

@@ -39,7 +39,7 @@ from mapp_env.validation import check_choice, check_count
 __all__ = ["DEFAULT_ITERATIONS", "Search", "solve_search"]
 
 DEFAULT_ITERATIONS = 200_000
-"""Iterations without a time limit: well under a second for 50 landmarks, and the same anywhere."""
+"""Iterations without a time limit: well under a second for 50 landmarks, on any clock."""
 
 MAX_ITERATIONS = 10**12
 
