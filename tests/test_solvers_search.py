@@ -18,6 +18,7 @@ from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
+from mapp_env.solvers.ruin_recreate import recreate
 from mapp_env.solvers.search import Search, solve_search
 from mapp_env.solvers.solution import Solution
 
@@ -214,6 +215,17 @@ def test_search_without_limits_ends() -> None:
     problem = generated_problem("random", 16, 6, 2, 0)
     counted = solve_search(problem, "makespan", iterations=search_module.DEFAULT_ITERATIONS)
     assert solve_search(problem, "makespan") == counted
+
+
+def test_an_empty_route_hides_no_other() -> None:
+    """A landmark goes where it costs least, also if an agent before that one has no route."""
+    grid = Grid(np.zeros((1, 6), np.bool_), 0)
+    search = Search(landmark_distances(Problem(grid, (4, 5), 2)), 2, "makespan", 1)
+    layout, team = search._layout._replace(weight=0), search._trial
+    team.routes[1, 0], team.sizes[1], team.lengths[1] = 1, 1, 8
+    search._scratch.removed[0] = 2
+    recreate(1, layout, team, search._scratch, search._memory)
+    assert (team.sizes.tolist(), team.lengths.tolist()) == ([0, 2], [0, 10])
 
 
 def test_depot_next_to_every_landmark() -> None:

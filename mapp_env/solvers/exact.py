@@ -25,7 +25,7 @@ from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.families import Families, smallest_limit
 from mapp_env.solvers.held_karp import route_tables, tours_within, trace_route
 from mapp_env.solvers.partition import split
-from mapp_env.solvers.solution import Solution
+from mapp_env.solvers.solution import Solution, solution_of
 
 __all__ = ["MAX_EXACT_LANDMARKS", "solve_exact"]
 
@@ -77,6 +77,5 @@ def solve_exact(
     for part in parts:
         route = np.empty(n_landmarks, np.int32)
         count = trace_route(distances, routes, closed, optimum, part, route)
-        found.append(tuple(problem.landmarks[order[k]] for k in route[:count].tolist()))
-    found += [()] * (problem.n_agents - len(found))
-    return Solution(tuple(found), optimum, True)
+        found.append((order[route[:count]] + 1).tolist())
+    return solution_of(problem, found, optimum, optimum)

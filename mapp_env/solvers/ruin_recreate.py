@@ -227,8 +227,13 @@ def recreate(
         least = FAR
         chosen = 0
         chosen_place = 0
+        tried_empty = False
         for agent in range(n_routes):
             size = team.sizes[agent]
+            if size == 0:
+                if tried_empty:
+                    continue  # all empty routes are alike
+                tried_empty = True
             before = 0
             for place in range(size + 1):
                 detour = distances[node, before]
@@ -248,8 +253,6 @@ def recreate(
                     least = cost
                     chosen = agent
                     chosen_place = place
-            if size == 0:
-                break  # all empty routes are alike
         route = team.routes[chosen]
         size = team.sizes[chosen]
         before = route[chosen_place - 1] if chosen_place > 0 else 0

@@ -33,7 +33,7 @@ from mapp_env.solvers.ruin_recreate import (
     Team,
     improve,
 )
-from mapp_env.solvers.solution import Routes, Solution
+from mapp_env.solvers.solution import Routes, Solution, solution_of
 from mapp_env.validation import check_choice, check_count
 
 __all__ = ["DEFAULT_ITERATIONS", "Search", "solve_search"]
@@ -119,10 +119,7 @@ def _solve(
         if not going or time.perf_counter() >= deadline:
             break
         chunk = CHUNK
-    routes = tuple(
-        tuple(problem.landmarks[node - 1] for node in route) for route in search.routes()
-    )
-    return Solution(routes, bound, search.cost == bound)
+    return solution_of(problem, search.routes(), search.cost, bound)
 
 
 @cache
@@ -152,7 +149,6 @@ class Search:
     ) -> None:
         distances = np.ascontiguousarray(distances, np.int32)
         n_landmarks = len(distances) - 1
-        self._n_agents = n_agents
         # No team walks less than one agent, by the triangle inequality.
         n_routes = 1 if objective == "total_distance" else n_agents
         home = distances[0].copy()
@@ -220,12 +216,11 @@ class Search:
         return int(self._memory[DONE])
 
     def routes(self) -> Routes:
-        """Return the best routes so far, as nodes 1 to K, one for each agent."""
-        found = [
+        """Return the best routes so far, as nodes 1 to K, for at most as many as agents."""
+        return tuple(
             tuple(route[:size].tolist())
             for route, size in zip(self._best.routes, self._best.sizes, strict=True)
-        ]
-        return (*found, *[()] * (self._n_agents - len(found)))
+        )
 
 
 def _empty_team(n_routes: int, n_landmarks: int) -> Team:
