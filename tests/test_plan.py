@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mapp_env import Grid, Plan, Problem, make_grid, replay, solve
+from mapp_env.walking import walk_tours
 
 LINE = Problem(Grid.from_text("#D...#"), (2, 4), 2)  # cells 1 to 4 are free
 
@@ -107,6 +108,14 @@ def test_a_plan_by_hand_verifies() -> None:
         plan.verify()
     with pytest.raises(ValueError, match="cover_time is stated as 4, the rules give 3"):
         dataclasses.replace(plan, cover_time=4).verify(LINE)
+
+
+def test_an_idle_agent_leaves_a_claim_to_who_arrives() -> None:
+    """Home early, agent 0 does not step on the landmark that agent 1 reaches at the same time."""
+    problem = Problem(Grid.from_text("...\n.D.\n..."), (3, 5), 2)
+    actions = walk_tours(problem, [(4, 5, 4), (4, 1, 0, 3, 4)])
+    assert actions.tolist() == [[1, 2], [0, 0], [1, 3]]
+    Plan(((4, 5, 4), (4, 1, 0, 3, 4)), ((5,), (3,)), 3, 4, 6).verify(problem)
 
 
 def test_long_plans_are_checked_quickly() -> None:

@@ -217,6 +217,16 @@ def test_search_without_limits_ends() -> None:
     assert solve_search(problem, "makespan") == counted
 
 
+def test_a_step_above_the_bound_is_not_the_end() -> None:
+    """A search at its bound ends in the end; at a cost one above it goes on."""
+    problem = Problem(make_grid(), (0, 6, 20, 42, 48), 3)
+    search = Search(landmark_distances(problem), 3, "cover_time")
+    assert search.run(10_000, 11)
+    assert search.iterations == 10_000
+    assert search.cost == 12
+    assert not search.run(10_000, 12)
+
+
 def test_an_empty_route_hides_no_other() -> None:
     """A landmark goes where it costs least, also if an agent before that one has no route."""
     grid = Grid(np.zeros((1, 6), np.bool_), 0)
