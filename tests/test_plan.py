@@ -119,8 +119,9 @@ def test_an_idle_agent_leaves_a_claim_to_who_arrives() -> None:
 
 
 def test_an_idle_agent_bumps_where_it_can() -> None:
-    """With a wall beside the depot, who has nothing to do stays there without the action to wait."""
-    assert walk_tours(LINE, [(1, 2, 3, 4, 3, 2, 1), ()]).tolist() == [[1, 0]] * 3
+    """With a wall beside the depot, an agent without a task stays, though a way is free first."""
+    problem = Problem(Grid.from_text("#...D#"), (1, 3), 2)
+    assert walk_tours(problem, [(4, 3, 2, 1, 2, 3, 4), ()]).tolist() == [[0, 1]] * 3
 
 
 def test_long_plans_are_checked_quickly() -> None:
