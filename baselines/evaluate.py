@@ -106,7 +106,7 @@ def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
             options["max_cycles"],
         )
         check_count("n_agents", setting.n_agents, 1, 16)
-        check_count("n_landmarks", setting.n_landmarks, 1, 64)
+        check_count("n_landmarks", setting.n_landmarks, 1, 256)
         check_count("max_cycles", setting.max_cycles, 1, 1_000_000)
     except KeyError as error:
         raise ValueError(f"{where}: no entry {error}") from error

@@ -140,7 +140,7 @@ class Args:
         check_choice("reward", self.reward, ("manhattan", "geodesic", "step"))
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_count("n_agents", self.n_agents, 1, 16)
-        check_count("n_landmarks", self.n_landmarks, 1, 64)
+        check_count("n_landmarks", self.n_landmarks, 1, 256)
         check_count("max_cycles", self.max_cycles, 1, 1_000_000)
         check_count("n_problems", self.n_problems, 1, 1_000_000)
         check_count("episodes_per_problem", self.episodes_per_problem, 1, 1_000_000)

@@ -29,7 +29,7 @@ class NetworkSpec:
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, tuple(NETWORKS))
         check_count("n_agents", self.n_agents, 1, 16)
-        check_count("n_landmarks", self.n_landmarks, 1, 64)
+        check_count("n_landmarks", self.n_landmarks, 1, 256)
         check_count("n_actions", self.n_actions, 4, 5)
         check_count("n_cells", self.n_cells, 2, 512 * 512)
         check_count("hidden_units", self.hidden_units, 1, 4096)

@@ -211,7 +211,7 @@ class Args:
         check_count("problems", self.problems, 1, 1_000_000)
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_count("n_agents", self.n_agents, 1, 16)
-        check_count("n_landmarks", self.n_landmarks, 1, 64)
+        check_count("n_landmarks", self.n_landmarks, 1, 256)
         check_count("max_cycles", self.max_cycles, 1, 1_000_000)
 
 

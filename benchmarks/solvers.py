@@ -2,7 +2,8 @@
 
 Landmarks are drawn at random on `paper-7x7` and on generated grids. "best known" is the proven
 optimum where the exact solver can take the problem, else the best of all methods and of a search of
-three times the time with another seed. One thread; figures of time drift with the machine.
+three times the time with another seed; "proven" is a cost that meets a lower bound. Searches end
+early then. One thread; times include the distances between landmarks, and drift with the machine.
 
     python benchmarks/solvers.py            # five minutes; --seconds 0.2 --instances 1 for a glance
     python benchmarks/solvers.py --grid rooms --objective makespan
@@ -24,11 +25,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapp_env import Grid, Problem, make_grid
+from mapp_env import Problem, make_grid
 from mapp_env.plan import OBJECTIVES
-from mapp_env.solvers.bounds import cell_distances
+from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
-from mapp_env.solvers.search import Search
+from mapp_env.solvers.pyvrp import solve_pyvrp
+from mapp_env.solvers.search import solve_search
+from mapp_env.solvers.solution import Solution
 
 SIZES = (  # side of the grid, landmarks, agents
     (7, 5, 3),
@@ -41,84 +44,74 @@ SIZES = (  # side of the grid, landmarks, agents
 REFERENCE = 3  # times as long as the others, for what cannot be solved exactly
 
 
-class Case(NamedTuple):
-    """One problem. A `Problem` has at most 64 landmarks, so distances are what is solved here."""
-
-    grid: Grid
-    cells: list[int]  # depot first
-    distances: np.ndarray  # (K + 1, K + 1) int32
-    n_agents: int
-
-
 class Found(NamedTuple):
     """What a method found."""
 
     cost: int
     seconds: float  # until then
+    proven: bool = False  # to be the optimum
 
 
-def draw_case(kind: str, side: int, n_landmarks: int, n_agents: int, seed: int) -> Case:
+def draw_problem(kind: str, side: int, n_landmarks: int, n_agents: int, seed: int) -> Problem:
     """Return the problem of a seed."""
     options = {"rows": side, "cols": side, "seed": seed}
     grid = make_grid("paper-7x7") if side == 7 else make_grid(kind, **options)
     rng = np.random.default_rng([side, n_landmarks, seed])
-    cells = [grid.depot, *rng.choice(grid.reachable, n_landmarks, replace=False).tolist()]
-    return Case(grid, cells, cell_distances(grid, np.array(cells)), n_agents)
+    landmarks = rng.choice(grid.reachable, n_landmarks, replace=False).tolist()
+    return Problem(grid, landmarks, n_agents)
 
 
-def exact(case: Case, objective: str, seconds: float) -> Found:
+def exact(problem: Problem, objective: str, seconds: float) -> Found:
     """Prove the optimum."""
-    problem = Problem(case.grid, case.cells[1:], case.n_agents)
     start = time.perf_counter()
-    return Found(solve_exact(problem, objective).bound, time.perf_counter() - start)
+    return Found(solve_exact(problem, objective).bound, time.perf_counter() - start, True)
 
 
-def search(case: Case, objective: str, seconds: float, seed: int = 0) -> Found:
+def search(problem: Problem, objective: str, seconds: float, seed: int = 0) -> Found:
     """Ruin and recreate for so many seconds."""
-    start = time.perf_counter()
-    run = Search(case.distances, case.n_agents, objective, seed)
-    best = Found(2**60, 0.0)
-    while (spent := time.perf_counter() - start) < seconds or best.seconds == 0:
-        run.run(100)
-        if run.cost < best.cost:
-            best = Found(run.cost, max(time.perf_counter() - start, spent))
-    return best
+    return watch(solve_search, problem, objective, seconds, seed)
 
 
-def pyvrp(case: Case, objective: str, seconds: float) -> Found:
+def pyvrp(problem: Problem, objective: str, seconds: float) -> Found:
     """PyVRP for so many seconds."""
-    from mapp_env.solvers.pyvrp import search_routes
+    return watch(solve_pyvrp, problem, objective, seconds, 0)
 
+
+def watch(
+    solver: Callable[..., Solution], problem: Problem, objective: str, seconds: float, seed: int
+) -> Found:
+    """Return the smallest cost that a search reports, and when it did."""
     start = time.perf_counter()
     best: list[Found] = []
-    search_routes(
-        case.distances,
-        case.n_agents,
+    solution = solver(
+        problem,
         objective,
-        start + seconds,
+        time_limit=seconds,
+        seed=seed,
         on_better=lambda cost: best.append(Found(cost, time.perf_counter() - start)),
     )
-    return best[-1]
+    return best[-1]._replace(proven=solution.optimal)
 
 
-def nearest_landmark(case: Case, objective: str, seconds: float) -> Found:
+def nearest_landmark(problem: Problem, objective: str, seconds: float) -> Found:
     """Let the agent that can be first on a landmark go there, until all are visited."""
     start = time.perf_counter()
-    n_agents = 1 if objective == "total_distance" else case.n_agents
+    distances = landmark_distances(problem)
+    n_agents = 1 if objective == "total_distance" else problem.n_agents
     at = np.zeros(n_agents, int)
     steps = np.zeros(n_agents, int)
-    left = np.arange(1, len(case.cells))
+    left = np.arange(1, len(distances))
     while left.size:
-        arrival = steps[:, None] + case.distances[at][:, left]
+        arrival = steps[:, None] + distances[at][:, left]
         agent, index = np.unravel_index(np.argmin(arrival), arrival.shape)
         steps[agent], at[agent] = arrival[agent, index], left[index]
         left = np.delete(left, index)
     if objective != "cover_time":
-        steps += case.distances[at, 0]
+        steps += distances[at, 0]
     return Found(int(steps.max()), time.perf_counter() - start)
 
 
-METHODS: dict[str, Callable[[Case, str, float], Found]] = {
+METHODS: dict[str, Callable[[Problem, str, float], Found]] = {
     "exact": exact,
     "search": search,
     "pyvrp": pyvrp,
@@ -126,29 +119,30 @@ METHODS: dict[str, Callable[[Case, str, float], Found]] = {
 }
 
 
-def compare(cases: Sequence[Case], objective: str, seconds: float) -> list[str]:
+def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list[str]:
     """Return one line of the table for each method."""
-    small = len(cases[0].cells) - 1 <= MAX_EXACT_LANDMARKS
+    small = len(problems[0].landmarks) <= MAX_EXACT_LANDMARKS
     found: dict[str, list[Found]] = {}
     for name, method in METHODS.items():
         if name == "exact" and not small:
             continue
         if name == "pyvrp" and importlib.util.find_spec("pyvrp") is None:
             continue
-        found[name] = [method(case, objective, seconds) for case in cases]
+        found[name] = [method(problem, objective, seconds) for problem in problems]
     best = [min(results).cost for results in zip(*found.values(), strict=True)]
     if small:
         assert best == [result.cost for result in found["exact"]], "below the optimum"
     else:
-        longer = [search(case, objective, REFERENCE * seconds, seed=1) for case in cases]
+        longer = [search(problem, objective, REFERENCE * seconds, seed=1) for problem in problems]
         best = [min(one, other.cost) for one, other in zip(best, longer, strict=True)]
     lines = []
     for name, results in found.items():
         gaps = [result.cost / one - 1 for result, one in zip(results, best, strict=True)]
         lines.append(
             f"{name:<16} | {mean(result.cost for result in results):7.1f} "
-            f"| {1000 * median(result.seconds for result in results):9.1f} "
-            f"| {100 * mean(gaps):6.2f} | {sum(gap == 0 for gap in gaps):3d}/{len(gaps)}"
+            f"| {1000 * median(result.seconds for result in results):10.1f} "
+            f"| {100 * mean(gaps):6.2f} | {sum(gap == 0 for gap in gaps):3d}/{len(gaps)} "
+            f"| {sum(result.proven for result in results):4d}/{len(gaps)}"
         )
     return lines
 
@@ -163,20 +157,20 @@ def main() -> None:
     args = parser.parse_args()
     # Compile, and load what is compiled, outside the times.
     for objective in OBJECTIVES:
-        compare([draw_case(args.grid, 7, 3, 2, 0)], objective, 0.01)
+        compare([draw_problem(args.grid, 7, 3, 2, 0)], objective, 0.01)
     print(
         f"{args.seconds:g} s for each search, {args.instances} problems of each size, "
         f"{args.grid} grids\n"
     )
     print(
         "grid / landmarks / agents | objective      | method           |    cost "
-        "| ms to best | gap % | best"
+        "| ms to best |  gap % | best  | proven"
     )
-    print("|".join("-" * width for width in (26, 16, 18, 9, 12, 7, 6)))
+    print("|".join("-" * width for width in (26, 16, 18, 9, 12, 8, 7, 8)))
     for side, n_landmarks, n_agents in SIZES:
         size = f"{side}x{side} / {n_landmarks} / {n_agents}"
-        cases = [
-            draw_case(args.grid, side, n_landmarks, n_agents, seed)
+        problems = [
+            draw_problem(args.grid, side, n_landmarks, n_agents, seed)
             for seed in range(args.instances)
         ]
         for objective in OBJECTIVES:
@@ -184,7 +178,7 @@ def main() -> None:
             repeated = objective == "total_distance" and n_landmarks == 100 and n_agents > 2
             if repeated or args.objective not in (None, objective):
                 continue
-            for line in compare(cases, objective, args.seconds):
+            for line in compare(problems, objective, args.seconds):
                 print(f"{size:<25} | {objective:<14} | {line}", flush=True)
 
 

@@ -279,14 +279,19 @@ class Grid:
             If a cell is off the grid or there is no path.
         """
         cell, last = self.cell("start", start), self.cell("end", end)
-        steps = self.home if last == self.depot else self.distances_from([last])[0]
+        if last == self.depot:
+            steps = self.home
+        else:
+            steps = np.full(self.n_cells, UNREACHABLE, np.int32)
+            if not self.walls.flat[last]:
+                # No farther than needed: on a large grid, ends are mostly close together.
+                fill_distances(self.moves, last, steps, np.empty_like(steps), cell)
+            _frozen(steps)
         if steps[cell] == UNREACHABLE:
             raise ValueError(f"there is no path from start {start} to end {end}")
-        path = [cell]
-        while cell != last:
-            cell = next(int(to) for to in self.moves[cell] if steps[to] == steps[cell] - 1)
-            path.append(cell)
-        return tuple(path)
+        path = np.full(steps[cell] + 1, cell, np.int32)
+        trace_path(self.moves, steps, path)
+        return tuple(path.tolist())
 
     # -- identity ----------------------------------------------------------------------
 
@@ -315,6 +320,7 @@ def fill_distances(
     start: int,
     steps: NDArray[np.int32],
     queue: NDArray[np.int32],
+    stop: int = -1,
 ) -> None:
     """Breadth-first search: write the steps from ``start`` to every cell into ``steps``.
 
@@ -326,6 +332,8 @@ def fill_distances(
         A free cell.
     steps, queue : ndarray of int32, shape (C,)
         The result, -1 where unreachable, and scratch space.
+    stop : int
+        A cell beyond which no distances are needed; those of all nearer ones are complete.
     """
     steps[:] = -1
     steps[start] = 0
@@ -339,8 +347,22 @@ def fill_distances(
             to = moves[cell, action]
             if steps[to] < 0:
                 steps[to] = steps[cell] + 1
+                if to == stop:
+                    return
                 queue[tail] = to
                 tail += 1
+
+
+@kernel
+def trace_path(moves: NDArray[np.int32], steps: NDArray[np.int32], path: NDArray[np.int32]) -> None:
+    """Fill in a path from its first cell on, to where ``steps`` is 0: one step less each time."""
+    for place in range(1, path.shape[0]):
+        cell = path[place - 1]
+        for action in range(4):
+            to = moves[cell, action]
+            if steps[to] == steps[cell] - 1:
+                path[place] = to
+                break
 
 
 def _frozen(array: NDArray[np.int32]) -> NDArray[np.int32]:

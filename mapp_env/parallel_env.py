@@ -41,7 +41,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     n_agents : int
         1 to 16.
     n_landmarks : int
-        1 to 64.
+        1 to 256.
     max_cycles : int
         Step at which an episode is truncated. The attribute may be assigned; an episode keeps the
         limit that it was reset with.

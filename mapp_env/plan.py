@@ -1,36 +1,28 @@
-"""Plans: one tour per agent, what they cost, and what the rules make of a list of joint actions."""
+"""Plans: one tour per agent and what they cost; checked, played again, kept in files."""
 
 from __future__ import annotations
 
 import math
 import os
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapp_env.dynamics import (
-    BY_COORDINATES,
-    NO_DISTANCES,
-    WAIT,
-    Reward,
-    cell_table,
-    measure_row,
-    reset_row,
-    row_length,
-    step_row,
-)
-from mapp_env.files import MAX_PLAN_BYTES, FileError, read_record, write_record
+from mapp_env.dynamics import WAIT
+from mapp_env.files import MAX_INTEGER, MAX_PLAN_BYTES, FileError, read_record, write_record
+from mapp_env.playing import Played, check_joint_actions, play
 from mapp_env.problem import Problem
-from mapp_env.validation import check_choice, describe
+from mapp_env.tour_checks import check_claims, check_tours
+from mapp_env.validation import as_integer, as_real, check_choice, describe
 from mapp_env.walking import walk_tours
 
 __all__ = ["OBJECTIVES", "STATUSES", "Plan", "replay"]
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 STATUSES = ("optimal", "feasible", "infeasible")
+
+MAX_SOLVER_LETTERS = 100
 
 
 @dataclass(frozen=True)
@@ -153,74 +145,55 @@ class Plan:
             detour after the last claim; a cost that is not what the rules give; a status or bound
             that contradicts the cost.
         """
+        self._verify(problem)
+
+    def _verify(self, problem: Problem | None = None) -> tuple[Problem, Played]:
+        """Verify, and return the problem and what the rules make of the plan."""
         problem = self.problem if problem is None else problem
         if not isinstance(problem, Problem):
             raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
-        check_choice("objective", self.objective, OBJECTIVES)
-        check_choice("status", self.status, STATUSES)
-        self._verify_tours(problem)
-        self._verify_claims(problem)
+        self._verify_labels()
+        if len(self.tours) != problem.n_agents or len(self.claims) != problem.n_agents:
+            raise ValueError(
+                f"plan: has {len(self.tours)} tours and {len(self.claims)} lists of claims, "
+                f"the problem has {problem.n_agents} agents"
+            )
+        check_tours(problem, self.tours)
+        check_claims(problem, self.tours, self.claims, self.success)
         unlimited = replace(problem, max_cycles=None)
         actions = self.actions
         if not actions and any(self.tours):
             actions = tuple(map(tuple, walk_tours(unlimited, self.tours).tolist()))
-        played = replay(unlimited, actions, self.objective)
-        for name in ("cover_time", "makespan", "total_distance", "claims", "tours"):
+        played = play(unlimited, check_joint_actions(actions, problem.n_agents))
+        for name in (*OBJECTIVES, "claims", "tours"):
             stated, given = getattr(self, name), getattr(played, name)
             if stated != given:
                 raise ValueError(
                     f"plan: {name} is stated as {describe(stated)}, the rules give "
                     f"{describe(given)}"
                 )
-        if self.actions and (self.claim_steps, self.actions) != (
-            played.claim_steps,
-            played.actions,
-        ):
-            raise ValueError("plan: claim_steps and actions are not what the rules give")
+        for name in ("claim_steps", "actions"):
+            stated = getattr(self, name)
+            # A plan made by hand may leave both out.
+            if stated != getattr(played, name) and (stated or self.actions):
+                raise ValueError("plan: claim_steps and actions are not what the rules give")
         self._verify_status()
+        return problem, played
 
-    def _verify_tours(self, problem: Problem) -> None:
-        grid = problem.grid
-        if len(self.tours) != problem.n_agents or len(self.claims) != problem.n_agents:
+    def _verify_labels(self) -> None:
+        check_choice("objective", self.objective, OBJECTIVES)
+        check_choice("status", self.status, STATUSES)
+        if not isinstance(self.solver, str) or len(self.solver) > MAX_SOLVER_LETTERS:
             raise ValueError(
-                f"plan: has {len(self.tours)} tours and {len(self.claims)} lists of claims, "
-                f"the problem has {problem.n_agents} agents"
+                f"plan: solver must be a str of at most {MAX_SOLVER_LETTERS} letters, "
+                f"got {describe(self.solver)}"
             )
-        for agent, tour in enumerate(self.tours):
-            if not tour:
-                continue
-            for cell in tour:
-                if grid.walls.flat[grid.cell(f"plan: tours[{agent}]: cell", cell)]:
-                    raise ValueError(f"plan: tours[{agent}] enters cell {cell}, which is a wall")
-            if tour[0] != grid.depot or tour[-1] != grid.depot:
-                raise ValueError(
-                    f"plan: tours[{agent}] must start and end at the depot, cell {grid.depot}; "
-                    f"it goes from {tour[0]} to {tour[-1]}"
-                )
-            for cell, to in pairwise(tour):
-                if cell == to or to not in grid.moves[cell]:
-                    raise ValueError(f"plan: tours[{agent}] jumps from cell {cell} to {to}")
-
-    def _verify_claims(self, problem: Problem) -> None:
-        claimed = [cell for cells in self.claims for cell in cells]
-        if len(set(claimed)) < len(claimed) or not set(claimed) <= set(problem.landmarks):
-            raise ValueError(
-                f"plan: claims must be landmarks, each once, got {describe(self.claims)}"
-            )
-        missing = sorted(set(problem.landmarks) - set(claimed))
-        if self.success and missing:
-            raise ValueError(f"plan: nobody claims the landmark on cell {missing[0]}")
-        for agent, (tour, cells) in enumerate(zip(self.tours, self.claims, strict=True)):
-            if bool(tour) != bool(cells):
-                raise ValueError(
-                    f"plan: agent {agent} has {len(cells)} claims and a tour of {len(tour)} cells"
-                )
-            if not _in_order(tour, cells):
-                raise ValueError(f"plan: tours[{agent}] does not visit its claims in their order")
-            if cells and tour[::-1].index(cells[-1]) != problem.grid.home[cells[-1]]:
-                raise ValueError(
-                    f"plan: tours[{agent}] must take a shortest path home from its last claim"
-                )
+        seconds = as_real(self.seconds)
+        if seconds is None or not 0 <= seconds <= MAX_INTEGER:
+            raise ValueError(f"plan: seconds must be a number from 0, got {describe(self.seconds)}")
+        bound = None if self.bound is None else as_integer(self.bound)
+        if self.bound is not None and (bound is None or bound < 0):
+            raise ValueError(f"plan: bound must be an integer from 0, got {describe(self.bound)}")
 
     def _verify_status(self) -> None:
         if (self.status == "infeasible") == self.success:
@@ -245,22 +218,20 @@ class Plan:
         ValueError
             If the plan is not right (:meth:`verify`), too large, or the file cannot be written.
         """
-        self.verify()
-        problem = self.problem
-        if problem is None:  # verify has refused it
-            return
-        columns = zip(*self.actions, strict=True) if self.actions else [()] * len(self.tours)
+        problem, played = self._verify()
+        # As played: what is equal but of another type, NumPy's integers say, is no JSON.
+        columns = zip(*played.actions, strict=True) if played.actions else [()] * len(self.tours)
         record = {
             "problem": problem.to_record(),
             "objective": self.objective,
             "status": self.status,
             "solver": self.solver,
-            "seconds": self.seconds,
-            "bound": self.bound,
-            **{name: _or_null(getattr(self, name)) for name in OBJECTIVES},
-            "tours": self.tours,
-            "claims": self.claims,
-            "claim_steps": self.claim_steps,
+            "seconds": float(self.seconds),
+            "bound": None if self.bound is None else int(self.bound),
+            **{name: _or_null(getattr(played, name)) for name in OBJECTIVES},
+            "tours": played.tours,
+            "claims": played.claims,
+            "claim_steps": played.claim_steps,
             "actions": ["".join(map(str, column)) for column in columns],
         }
         write_record(path, "plan", record, MAX_PLAN_BYTES)
@@ -294,7 +265,7 @@ class Plan:
             status=source.choice("status", STATUSES),
             claim_steps=source.cell_lists("claim_steps", n_agents),
             actions=tuple(tuple(map(int, step)) for step in zip(*columns, strict=True)),
-            solver=source.text("solver", 100),
+            solver=source.text("solver", MAX_SOLVER_LETTERS),
             seconds=source.real("seconds"),
             bound=source.number("bound", null=None),
             problem=problem,
@@ -305,12 +276,6 @@ class Plan:
         except ValueError as error:
             raise FileError(f"{source.where}: {error}") from error
         return plan
-
-
-def _in_order(tour: tuple[int, ...], cells: tuple[int, ...]) -> bool:
-    """Return whether a tour comes by some cells in their order."""
-    rest = iter(tour)
-    return all(cell in rest for cell in cells)
 
 
 def _or_null(cost: float) -> int | None:
@@ -341,80 +306,6 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
     if not isinstance(problem, Problem):
         raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
     check_choice("objective", objective, OBJECTIVES)
-    actions = _check_joint_actions(joint_actions, problem.n_agents)
-    n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
-    grid = problem.grid
-    table = cell_table(grid)
-    row = np.zeros(row_length(n_agents, n_landmarks), np.int32)
-    landmarks = np.array(problem.landmarks, np.int32)
-    reset_row(row, landmarks, grid.depot, n_agents, n_landmarks)
-    flags = row[n_agents + n_landmarks : n_agents + 2 * n_landmarks]
-    limit = len(actions) if problem.max_cycles is None else problem.max_cycles
-    routes = [[grid.depot] for _ in range(n_agents)]
-    tours: list[tuple[int, ...]] = [()] * n_agents
-    claims: list[list[int]] = [[] for _ in range(n_agents)]
-    claim_steps: list[list[int]] = [[] for _ in range(n_agents)]
-    steps = 0
-    for joint_action in actions[:limit]:
-        before = flags.copy()
-        steps += 1
-        _, terminated, _ = step_row(
-            row,
-            joint_action,
-            n_agents,
-            n_landmarks,
-            limit,
-            int(Reward.STEP),
-            table,
-            NO_DISTANCES,
-            BY_COORDINATES,
-        )
-        cells = row[:n_agents].tolist()
-        for agent, cell in enumerate(cells):
-            if cell != routes[agent][-1]:
-                routes[agent].append(cell)
-        for landmark in np.flatnonzero(flags != before):
-            cell = problem.landmarks[landmark]
-            agent = cells.index(cell)
-            claims[agent].append(cell)
-            claim_steps[agent].append(steps)
-            tours[agent] = (*routes[agent], *grid.path(cell, grid.depot)[1:])
-        if terminated:
-            break
-    costs = measure_row(row, n_agents, n_landmarks, table)
-    whole = bool(flags.all())
-    cover_time, makespan, total = (int(cost) if whole else math.inf for cost in costs)
-    return Plan(
-        tours=tuple(tours),
-        claims=tuple(map(tuple, claims)),
-        cover_time=cover_time,
-        makespan=makespan,
-        total_distance=total,
-        objective=objective,
-        status="feasible" if whole else "infeasible",
-        claim_steps=tuple(map(tuple, claim_steps)),
-        actions=tuple(map(tuple, actions[:steps].tolist())),
-        problem=problem,
-    )
-
-
-def _check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]:
-    """Return joint actions as an int64 array of shape (T, N)."""
-    try:
-        array = np.asarray(joint_actions)
-    except (ValueError, RecursionError):
-        array = np.array(None)  # ragged, or nested too deep
-    if array.shape in ((0,), (0, n_agents)):
-        return np.empty((0, n_agents), np.int64)
-    if array.ndim != 2 or array.shape[1] != n_agents or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"joint_actions must be integers of shape (T, {n_agents}), "
-            f"got {describe(joint_actions)}"
-        )
-    wrong = np.argwhere((array < 0) | (array > WAIT))
-    if len(wrong):
-        step, agent = wrong[0].tolist()
-        raise ValueError(
-            f"joint_actions[{step}, {agent}] must be in 0..{WAIT}, got {array[step, agent]}"
-        )
-    return np.ascontiguousarray(array, np.int64)
+    played = play(problem, check_joint_actions(joint_actions, problem.n_agents))
+    status = "feasible" if played.cover_time < math.inf else "infeasible"
+    return Plan(**played._asdict(), objective=objective, status=status, problem=problem)

@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 MAX_AGENTS = 16
-MAX_LANDMARKS = 64
+MAX_LANDMARKS = 256
 MAX_CYCLES = 1_000_000
 
 MAX_LISTED = 1_000_000  # problems of a grid that are listed to draw from; beyond, by rejection
@@ -45,7 +45,7 @@ class Problem:
     grid : Grid
         The grid with its depot.
     landmarks : sequence of int or of (int, int)
-        1 to 64 distinct cells, or their rows and columns: free, reachable from the depot and not
+        1 to 256 distinct cells, or their rows and columns: free, reachable from the depot and not
         the depot (rule R2). Their order is kept.
     n_agents : int
         1 to 16.
@@ -153,7 +153,7 @@ def check_landmarks(
     landmarks : sequence of int or of (int, int)
         The cells, or their rows and columns.
     count : int, optional
-        How many there must be; by default any number from 1 to 64.
+        How many there must be; by default any number from 1 to 256.
     name : str
         How messages call the argument.
 

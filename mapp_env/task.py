@@ -57,7 +57,7 @@ class Task:
     n_agents : int
         1 to 16.
     n_landmarks : int
-        1 to 64, and no more than cells that can be reached.
+        1 to 256, and no more than cells that can be reached.
     max_cycles : int
         Step at which an episode is truncated (R7), 1 to 1,000,000.
     reward : {"manhattan", "geodesic", "step"}

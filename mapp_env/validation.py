@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import reprlib
 from collections.abc import Iterable, Sequence
@@ -9,7 +10,15 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["MAX_SEED", "as_integer", "check_choice", "check_count", "check_flag", "describe"]
+__all__ = [
+    "MAX_SEED",
+    "as_integer",
+    "as_real",
+    "check_choice",
+    "check_count",
+    "check_flag",
+    "describe",
+]
 
 MAX_SEED = 2**128 - 1
 
@@ -44,6 +53,17 @@ def as_integer(value: object) -> int | None:
         return operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         return None
+
+
+def as_real(value: object) -> float | None:
+    """Return ``value`` as a finite ``float``, or ``None`` if it is no real number by its type."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
 
 
 def check_count(name: str, value: object, low: int, high: int) -> int:

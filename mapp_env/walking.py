@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -48,33 +49,37 @@ def walk_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> NDArray[np.i
         Actions 0 to 3, but for the exception above.
     """
     grid = problem.grid
-    moves = grid.moves
-    cells = [grid.depot] * problem.n_agents
-    left = set(problem.landmarks)
-    actions: list[list[int]] = []
-    step = 0
-    while left and step < max(map(len, tours)):
-        step += 1
-        joint_action = []
-        for agent, tour in enumerate(tours):
-            ways = moves[cells[agent]].tolist()
-            if step < len(tour):
-                action = ways.index(tour[step])
-            else:
-                action = _idle_action(ways, cells[agent], grid.depot, left)
-            joint_action.append(action)
-            if action != WAIT:
-                cells[agent] = ways[action]
+    # Who comes by each landmark first, and when; in one step, the agent of the lowest index.
+    claims: dict[int, tuple[float, int]] = dict.fromkeys(problem.landmarks, (math.inf, 0))
+    for agent, tour in enumerate(tours):
+        for step, cell in enumerate(tour):
+            if cell in claims and (step, agent) < claims[cell]:
+                claims[cell] = (step, agent)
+    n_steps = max(step for step, _ in claims.values())
+    if n_steps == math.inf:
+        n_steps = max(0, *(len(tour) - 1 for tour in tours))
+    actions = np.empty((int(n_steps), len(tours)), np.int64)
+    for agent, tour in enumerate(tours):
+        cells = np.array(tour[: len(actions) + 1], np.int64)
+        walked = max(len(cells) - 1, 0)
+        ways = grid.moves[cells[:-1]]
+        actions[:walked, agent] = (ways == cells[1:, None]).argmax(axis=1)
+        actions[walked:, agent] = _idle_actions(grid, claims, agent, walked, len(actions))
+    return actions
+
+
+def _idle_actions(
+    grid: Grid, claims: dict[int, tuple[float, int]], agent: int, start: int, end: int
+) -> list[int]:
+    """Return the actions of an agent on the depot, after step ``start``, that claim nothing."""
+    ways = grid.moves[grid.depot].tolist()
+    if grid.depot in ways:
+        return [ways.index(grid.depot)] * (end - start)
+    for step in range(start, end):
+        for action, to in enumerate(ways):
             # Agents claim in the order of their index, so who comes later may follow.
-            left.discard(cells[agent])
-        actions.append(joint_action)
-    return np.array(actions, np.int64).reshape(-1, problem.n_agents)
-
-
-def _idle_action(ways: list[int], cell: int, depot: int, left: set[int]) -> int:
-    """Return an action that claims nothing: home, else a bump, else to a visited neighbour."""
-    if cell != depot:
-        return ways.index(depot)
-    if cell in ways:
-        return ways.index(cell)
-    return next((action for action, to in enumerate(ways) if to not in left), WAIT)
+            if claims.get(to, (0, 0)) < (step + 1, agent):
+                back = grid.moves[to].tolist().index(grid.depot)
+                to_and_fro = [action, back] * (end - step)
+                return [WAIT] * (step - start) + to_and_fro[: end - step]
+    return [WAIT] * (end - start)

@@ -92,6 +92,21 @@ def test_allowed_extremes(arguments: dict[str, Any]) -> None:
         make(**arguments).reset(seed=0)
 
 
+def test_most_landmarks() -> None:
+    """Up to 256 landmarks are a problem; one more is refused by name wherever it can be asked."""
+    grid = mapp_env.Grid(np.zeros((17, 17), bool))
+    cells = grid.reachable[:257].tolist()
+    assert len(mapp_env.Problem(grid, cells[:256], 2).landmarks) == 256
+    assert mapp_env.sample_problems(grid, 2, 256).shape == (2, 256)
+    env = mapp_v0.parallel_env(grid=grid, n_landmarks=256)
+    env.reset(options={"landmarks": cells[:256]})
+    assert env.state().shape == (3 + 2 * 256,)
+    refusal("n_landmarks", 257, lambda: mapp_v0.parallel_env(grid=grid, n_landmarks=257))
+    refusal("n_landmarks", 257, lambda: mapp_env.sample_problems(grid, 2, 257))
+    with pytest.raises(ValueError, match=r"landmarks must hold 1\.\.256 cells"):
+        mapp_env.Problem(grid, cells, 2)
+
+
 def test_more_landmarks_than_cells() -> None:
     """More landmarks than the grid has cells for are refused; exactly as many are fine."""
     grid = mapp_env.Grid.from_text("D..\n")

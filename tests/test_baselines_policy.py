@@ -232,6 +232,6 @@ def test_what_is_no_path_is_refused_by_name(path):
 
 def test_largest_network_can_be_loaded_again(tmp_path):
     """The most units, agents, landmarks and actions that a spec allows fit under the cap."""
-    spec = NetworkSpec("paper", 16, 64, 5, 512 * 512, 4096)
+    spec = NetworkSpec("paper", 16, 256, 5, 512 * 512, 4096)
     save_policy(tmp_path / "w", build_network(spec, torch_generator(np.random.SeedSequence(0))))
     assert load_policy(tmp_path / "w").spec == spec

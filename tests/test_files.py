@@ -16,7 +16,7 @@ import mapp_env
 from mapp_env import FileError, Grid, Plan, Problem, make_grid, replay, solve
 from mapp_env.files import MAX_PLAN_BYTES, MAX_PROBLEM_BYTES, write_text
 from mapp_env.solvers import save_vrplib
-from mapp_env.solvers.bounds import landmark_distances
+from mapp_env.solvers.distances import landmark_distances
 
 # With claims at step 1 and on cell 0, which Python takes for True and False.
 PROBLEM = Problem(make_grid(), (48, 0, 6, 25), 2, max_cycles=40)
@@ -333,13 +333,26 @@ def test_a_broken_plan_is_not_saved(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_plan_by_hand_is_saved_as_played(tmp_path: Path) -> None:
+    """Without actions, and with NumPy's integers, a plan is saved; it loads with its actions."""
+    tours = (tuple(np.array([24, 25, 24])), ())
+    by_hand = Plan(
+        tours, ((np.int64(25),), ()), 1, 2, 2, problem=Problem(make_grid(), (25,), 2), bound=1
+    )
+    by_hand.save(tmp_path / "plan.json")
+    loaded = Plan.load(tmp_path / "plan.json")
+    assert (loaded.tours, loaded.claims, loaded.bound) == (by_hand.tours, by_hand.claims, 1)
+    assert loaded.claim_steps == ((1,), ())
+    assert replay(by_hand.problem, loaded.joint_actions()).tours == tours
+
+
 # -- distances for other solvers -----------------------------------------
 
 
 def test_vrplib_is_read_by_an_independent_reader(tmp_path: Path) -> None:
     """The vrplib package reads the matrix, the demands and the depot that were written."""
     rng = np.random.default_rng(4)
-    for n_landmarks in (1, 2, 17, 64):
+    for n_landmarks in (1, 2, 17, 256):
         walls = rng.random((20, 30)) < 0.2
         walls[10, 15] = False
         grid = Grid(walls, (10, 15))

@@ -205,6 +205,7 @@ def test_names() -> None:
         ("random", {"density": 0.41}, r"density must be a number in 0\.\.0\.4, got 0\.41"),
         ("random", {"density": float("nan")}, "density must be a number .* got nan"),
         ("random", {"density": "0.2"}, "density must be a number .* got '0.2'"),
+        ("random", {"density": 10**400}, r"density must be a number in 0\.\.0\.4"),
         ("random", {"density": True}, "density must be a number .* got True"),
         ("rooms", {"room": 1}, r"room must be an integer in 2\.\.256, got 1"),
         ("maze", {"loops": -0.1}, r"loops must be a number in 0\.\.1, got -0\.1"),
@@ -227,5 +228,9 @@ def test_bad_arguments_are_refused(name: str, options: dict[str, object], messag
 
 def test_hopeless_density_is_refused() -> None:
     """Where no draw is connected, as on a long strip, the message says what to change."""
-    with pytest.raises(ValueError, match="use a smaller density or another seed"):
-        make_grid("random", rows=2, cols=512, density=0.4)
+    make_grid("random")
+    for rows in (2, 40):
+        start = time.process_time()
+        with pytest.raises(ValueError, match="use a smaller density or another seed"):
+            make_grid("random", rows=rows, cols=512, density=0.4)
+        assert time.process_time() - start < 3

@@ -525,16 +525,16 @@ def test_large_grid_plays_the_model(reward_kind: str, kind: str) -> None:
 
 
 def test_largest_grid_and_counts() -> None:
-    """A 512x512 grid with 16 agents and 64 landmarks resets and steps, with every reward."""
+    """A 512x512 grid with 16 agents and 256 landmarks resets and steps, with every reward."""
     grid = mapp_env.Grid.from_text("\n".join(["." * 512] * 512) + "\n")
     for reward in REWARDS:
-        env = mapp_v0.parallel_env(grid=grid, n_agents=16, n_landmarks=64, reward=reward)
+        env = mapp_v0.parallel_env(grid=grid, n_agents=16, n_landmarks=256, reward=reward)
         env.reset(seed=0)
         before = env.state()
         _, rewards, *_ = env.step(dict.fromkeys(env.agents, 1))
         after = env.state()
         assert (after[:16] == before[:16] + 1).all()
-        places = after[16:80].astype(int)
+        places = after[16:272].astype(int)
         here = int(after[0])
         far = sum(
             abs(cell // 512 - here // 512) + abs(cell % 512 - here % 512)

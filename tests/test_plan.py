@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mapp_env import Grid, Plan, Problem, make_grid, replay, solve
+from mapp_env.walking import walk_tours
 
 LINE = Problem(Grid.from_text("#D...#"), (2, 4), 2)  # cells 1 to 4 are free
 
@@ -108,6 +110,33 @@ def test_a_plan_by_hand_verifies() -> None:
         dataclasses.replace(plan, cover_time=4).verify(LINE)
 
 
+def test_an_idle_agent_leaves_a_claim_to_who_arrives() -> None:
+    """Home early, agent 0 does not step on the landmark that agent 1 reaches at the same time."""
+    problem = Problem(Grid.from_text("...\n.D.\n..."), (3, 5), 2)
+    actions = walk_tours(problem, [(4, 5, 4), (4, 1, 0, 3, 4)])
+    assert actions.tolist() == [[1, 2], [0, 0], [1, 3]]
+    Plan(((4, 5, 4), (4, 1, 0, 3, 4)), ((5,), (3,)), 3, 4, 6).verify(problem)
+
+
+def test_an_idle_agent_bumps_where_it_can() -> None:
+    """With a wall beside the depot, an agent without a task stays, though a way is free first."""
+    problem = Problem(Grid.from_text("#...D#"), (1, 3), 2)
+    assert walk_tours(problem, [(4, 3, 2, 1, 2, 3, 4), ()]).tolist() == [[0, 1]] * 3
+
+
+def test_long_plans_are_checked_quickly() -> None:
+    """A tour of a hundred thousand cells verifies, or is found to jump, within two seconds."""
+    plan = Plan(((1, 2) * 50_000 + (1, 2, 3, 4, 3, 2, 1), ()), ((2, 4), ()), 100_003, 100_006, 1)
+    solve(LINE).verify()  # loads the kernels
+    start = time.process_time()
+    with pytest.raises(ValueError, match="total_distance is stated as 1, the rules give 100006"):
+        plan.verify(LINE)
+    jump = dataclasses.replace(plan, tours=(plan.tours[0][:-3] + plan.tours[0][-2:], ()))
+    with pytest.raises(ValueError, match="jumps from cell 4 to 2"):
+        jump.verify(LINE)
+    assert time.process_time() - start < 2
+
+
 OPEN = Problem(Grid.from_text("...\n.D.\n..#"), (0, 2), 2)  # cells 0 to 7 are free
 PLAN = replay(OPEN, [[0, 1], [2, 2]])
 TOURS = ((4, 3, 0, 1, 4), (4, 5, 2, 1, 4))
@@ -148,6 +177,13 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "solved and infeasible": ({"status": "infeasible"}, "contradicts success=True"),
     "bound": ({"bound": 3}, "bound 3 is above the cost"),
     "unproven": ({"status": "optimal"}, "'optimal' needs bound"),
+    "a pair for a cell": ({"tours": ((4, (1, 0), 0, 1, 4), TOURS[1])}, "must be a cell in 0..8"),
+    "a huge number": ({"tours": ((4, 10**30, 4), TOURS[1])}, "must be a cell in 0..8"),
+    "claim steps alone": ({"actions": (), "claim_steps": ((9,), (9,))}, "claim_steps and actions"),
+    "no number for a bound": ({"bound": math.nan}, "bound must be an integer from 0, got nan"),
+    "bound below 0": ({"bound": -1}, "bound must be an integer from 0, got -1"),
+    "no number of seconds": ({"seconds": math.nan}, "seconds must be a number from 0, got nan"),
+    "a long name": ({"solver": "x" * 101}, "solver must be a str of at most 100 letters"),
     "below the bound": ({"status": "optimal", "bound": 1}, "'optimal' needs bound"),
 }
 

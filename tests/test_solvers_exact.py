@@ -24,11 +24,11 @@ from mapp_env.dynamics import (
     row_length,
     step_row,
 )
-from mapp_env.solvers import exact as exact_module
-from mapp_env.solvers import solve_universe
+from mapp_env.solvers import partition, solve_universe
 from mapp_env.solvers.batch import least_worst
-from mapp_env.solvers.bounds import landmark_distances, lower_bound
-from mapp_env.solvers.exact import route_costs, shortest_routes
+from mapp_env.solvers.bounds import lower_bound, tree_bound
+from mapp_env.solvers.distances import landmark_distances
+from mapp_env.solvers.held_karp import route_costs, shortest_routes
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 SHAPES = ((7, 7), (1, 9), (12, 1), (2, 5), (5, 3), (4, 11), (3, 3), (9, 6), (2, 2), (10, 10))
@@ -255,7 +255,7 @@ def test_both_ways_of_breaking_ties_agree(monkeypatch: pytest.MonkeyPatch) -> No
         for objective in ("cover_time", "makespan"):
             found = []
             for few in (1, 100):
-                monkeypatch.setattr(exact_module, "FEW_AGENTS", few)
+                monkeypatch.setattr(partition, "FEW_AGENTS", few)
                 plan = solve(problem, objective, "exact")
                 found.append((plan.cost, plan.total_distance))
             assert found[0] == found[1]
@@ -265,7 +265,7 @@ def test_ties_are_not_broken_with_agents_there_are_not(monkeypatch: pytest.Monke
     """Where the table for any number of agents takes three, the plan makes do with its two."""
     problem = Problem(Grid(np.zeros((4, 11), bool), 9), (42, 30, 27, 41, 10), 2)
     for few in (1, 100):
-        monkeypatch.setattr(exact_module, "FEW_AGENTS", few)
+        monkeypatch.setattr(partition, "FEW_AGENTS", few)
         plan = solve(problem, "cover_time", "exact")
         assert (plan.cost, plan.total_distance) == brute_force(problem)["cover_time"] == (6, 22)
 
@@ -390,6 +390,25 @@ def test_bound_below_optimum_below_policies() -> None:
     # The two comparisons compare something.
     assert tight > 200
     assert solved > 60
+
+
+def test_bound_is_the_optimum_of_few_landmarks() -> None:
+    """Up to 12 landmarks the lower bound is the optimum; beyond, it is not below the trees' one."""
+    rng = np.random.default_rng(16)
+    raised = 0
+    for _ in range(30):
+        problem = random_problem(rng, 14, 6, (9, 9), 10)
+        distances = landmark_distances(problem)
+        for objective in OBJECTIVES:
+            optimum = solve(problem, objective, "exact").cost
+            bound = lower_bound(problem, objective, distances)
+            closed = objective != "cover_time"
+            teams = 1 if objective == "total_distance" else problem.n_agents
+            low = tree_bound(distances, teams, closed)
+            assert distances[0].max() * (2 if closed else 1) <= low <= bound <= optimum
+            assert bound == optimum or len(problem.landmarks) > 12
+            raised += low < bound and len(problem.landmarks) > 12
+    assert raised > 5
 
 
 def test_distance_alone_is_one_agents_tour() -> None:
@@ -524,7 +543,7 @@ def test_solve_refuses_bad_arguments() -> None:
         solve(problem, "distance")
     with pytest.raises(ValueError, match="method must be one of"):
         solve(problem, method="magic")
-    for limit in (0, -1, math.nan, math.inf, True, "1"):
+    for limit in (0, -1, math.nan, math.inf, True, "1", 10**400, 1j, np.complex128(1)):
         with pytest.raises(ValueError, match="time_limit must be"):
             solve(problem, time_limit=limit)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="seed must be"):

@@ -14,9 +14,11 @@ import pytest
 
 from mapp_env import Grid, Problem, make_grid, sample_problems, solve
 from mapp_env.solvers import search as search_module
-from mapp_env.solvers.bounds import landmark_distances, lower_bound
+from mapp_env.solvers.bounds import lower_bound
+from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
+from mapp_env.solvers.ruin_recreate import recreate
 from mapp_env.solvers.search import Search, solve_search
 from mapp_env.solvers.solution import Solution
 
@@ -109,10 +111,10 @@ def test_search_finds_optima_of_middling_problems(kind: str) -> None:
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize(
-    ("n_landmarks", "n_agents"), [(1, 1), (1, 16), (2, 5), (3, 16), (64, 1), (64, 16), (20, 7)]
+    ("n_landmarks", "n_agents"), [(1, 1), (1, 16), (2, 5), (3, 16), (256, 1), (256, 16), (20, 7)]
 )
 def test_search_takes_all_sizes(objective: str, n_landmarks: int, n_agents: int) -> None:
-    """From one landmark and one agent to 64 and 16, routes are whole and not below the bound."""
+    """From one landmark and one agent to 256 and 16, routes are whole and not below the bound."""
     problem = generated_problem("rooms", 24, n_landmarks, n_agents, 5)
     found = solve_search(problem, objective, iterations=300)
     cost = costs(problem, found)[objective]
@@ -179,6 +181,19 @@ def test_search_keeps_to_its_time() -> None:
     assert 0.3 <= seconds < 1.5
 
 
+@pytest.mark.parametrize("kind", ["random", "maze"])
+def test_the_largest_grids_take_little_longer(kind: str) -> None:
+    """On 512 x 512 cells distances and tours are not in the time limit, but they take no second."""
+    grid = make_grid(kind, rows=512, cols=512, seed=1)
+    problem = Problem(grid, sample_problems(grid, 1, 64, 3)[0].tolist(), 5)
+    solve(problem, method="search", time_limit=0.01)
+    start = time.process_time()
+    for objective in OBJECTIVES:
+        plan = solve(problem, objective, method="search", time_limit=0.05)
+        assert plan.cost < 10**9
+    assert time.process_time() - start < 6
+
+
 def test_search_ends_at_the_bound() -> None:
     """Where the bound is met the search ends long before its time."""
     problem = generated_problem("random", 32, 20, 16, 0)
@@ -188,11 +203,39 @@ def test_search_ends_at_the_bound() -> None:
     assert time.perf_counter() - start < 15
 
 
+def test_search_proves_small_optima() -> None:
+    """Five landmarks of the default grid: what the search finds is proven, and at once."""
+    problem = Problem(make_grid(), (0, 6, 20, 42, 48), 3)
+    plan = solve(problem, method="search")
+    assert (plan.cost, plan.status, plan.bound) == (12, "optimal", 12)
+
+
 def test_search_without_limits_ends() -> None:
     """Without a time limit a fixed number of iterations is carried out."""
     problem = generated_problem("random", 16, 6, 2, 0)
     counted = solve_search(problem, "makespan", iterations=search_module.DEFAULT_ITERATIONS)
     assert solve_search(problem, "makespan") == counted
+
+
+def test_a_step_above_the_bound_is_not_the_end() -> None:
+    """A search at its bound ends in the end; at a cost one above it goes on."""
+    problem = Problem(make_grid(), (0, 6, 20, 42, 48), 3)
+    search = Search(landmark_distances(problem), 3, "cover_time")
+    assert search.run(10_000, 11)
+    assert search.iterations == 10_000
+    assert search.cost == 12
+    assert not search.run(10_000, 12)
+
+
+def test_an_empty_route_hides_no_other() -> None:
+    """A landmark goes where it costs least, also if an agent before that one has no route."""
+    grid = Grid(np.zeros((1, 6), np.bool_), 0)
+    search = Search(landmark_distances(Problem(grid, (4, 5), 2)), 2, "makespan", 1)
+    layout, team = search._layout._replace(weight=0), search._trial
+    team.routes[1, 0], team.sizes[1], team.lengths[1] = 1, 1, 8
+    search._scratch.removed[0] = 2
+    recreate(1, layout, team, search._scratch, search._memory)
+    assert (team.sizes.tolist(), team.lengths.tolist()) == ([0, 2], [0, 10])
 
 
 def test_depot_next_to_every_landmark() -> None:
@@ -275,7 +318,7 @@ def test_search_is_no_worse_than_pyvrp(objective: str) -> None:
 
 
 @needs_pyvrp
-@pytest.mark.parametrize(("n_landmarks", "n_agents"), [(1, 1), (1, 16), (64, 16)])
+@pytest.mark.parametrize(("n_landmarks", "n_agents"), [(1, 1), (1, 16), (256, 16)])
 def test_pyvrp_takes_all_sizes(n_landmarks: int, n_agents: int) -> None:
     """Through solve() as well, and within its time."""
     problem = generated_problem("rooms", 24, n_landmarks, n_agents, 5)

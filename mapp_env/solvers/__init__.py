@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import replace
-
-import numpy as np
 
 from mapp_env.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
@@ -15,7 +12,7 @@ from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.solution import Routes, Solution, Solver
 from mapp_env.solvers.universe import solve_universe
 from mapp_env.solvers.vrplib import save_vrplib
-from mapp_env.validation import MAX_SEED, check_choice, check_count, describe
+from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, describe
 from mapp_env.walking import tour_through, walk_tours
 
 __all__ = ["METHODS", "Solution", "optimal_costs", "save_vrplib", "solve", "solve_universe"]
@@ -48,7 +45,9 @@ def solve(
         package of that name. "auto" is "exact" up to 20 landmarks (16, if ``time_limit`` is less
         than two seconds), else "search".
     time_limit : float, optional
-        Seconds that a search may take; "exact" has no use for it.
+        Seconds that a search may take; "exact" has no use for it. The distances between landmarks
+        come first and a plan's tours last, however few seconds there are: together half a second
+        for 64 landmarks on 512 x 512 cells, a second where tours have a hundred thousand cells.
     seed : int
         Of a search.
 
@@ -96,10 +95,10 @@ def _check_time_limit(value: object) -> float | None:
     """Return a time limit as a float, or None."""
     if value is None:
         return None
-    number = not isinstance(value, bool) and isinstance(value, int | float | np.number)
-    if not number or not 0 < value < math.inf:  # type: ignore[operator]
+    seconds = as_real(value)
+    if seconds is None or seconds <= 0:
         raise ValueError(f"time_limit must be a positive number or None, got {describe(value)}")
-    return float(value)  # type: ignore[arg-type]
+    return seconds
 
 
 def _plan_of(problem: Problem, objective: str, solution: Solution) -> Plan:

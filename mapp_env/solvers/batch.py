@@ -11,8 +11,8 @@ from mapp_env.compiled import kernel
 from mapp_env.grid import Grid
 from mapp_env.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
-from mapp_env.solvers.bounds import cell_distances
-from mapp_env.solvers.exact import route_costs, shortest_routes
+from mapp_env.solvers.distances import cell_distances
+from mapp_env.solvers.held_karp import route_costs, shortest_routes
 from mapp_env.validation import check_choice, check_count, describe
 
 __all__ = ["MAX_BATCH_LANDMARKS", "Workspace", "optimal_costs", "solve_rows"]

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from mapp_env.plan import OBJECTIVES
 from mapp_env.problem import Problem
-from mapp_env.solvers.bounds import landmark_distances, lower_bound
-from mapp_env.solvers.solution import Routes, Solution
+from mapp_env.solvers.bounds import lower_bound
+from mapp_env.solvers.distances import landmark_distances
+from mapp_env.solvers.solution import Routes, Solution, solution_of
 from mapp_env.validation import check_choice
 
 __all__ = ["DEFAULT_SECONDS", "search_routes", "solve_pyvrp"]
@@ -81,8 +82,7 @@ def solve_pyvrp(
     cost, nodes = search_routes(
         distances, problem.n_agents, objective, deadline, seed, bound, on_better
     )
-    routes = tuple(tuple(problem.landmarks[node - 1] for node in route) for route in nodes)
-    return Solution(routes, bound, cost == bound)
+    return solution_of(problem, nodes, cost, bound)
 
 
 def search_routes(
@@ -94,7 +94,7 @@ def search_routes(
     bound: int = 0,
     on_better: Callable[[int], None] | None = None,
 ) -> tuple[int, Routes]:
-    """Return the cost and the routes, as nodes 1 to K, one for each agent.
+    """Return the cost and the routes, as nodes 1 to K, of the agents that have one.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def search_routes(
             break
     if not routes:
         raise RuntimeError("PyVRP found no plan, though nothing limits one")
-    return best, (*routes, *[()] * (n_agents - len(routes)))
+    return best, routes
 
 
 class _Stop:

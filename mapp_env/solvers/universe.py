@@ -13,7 +13,7 @@ from mapp_env.grid import Grid
 from mapp_env.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
 from mapp_env.solvers.batch import CHUNK_WORK, MAX_BATCH_LANDMARKS, Workspace, solve_rows
-from mapp_env.solvers.bounds import cell_distances
+from mapp_env.solvers.distances import cell_distances
 from mapp_env.validation import check_choice, check_count
 
 __all__ = ["MAX_UNIVERSE_PROBLEMS", "MAX_UNIVERSE_WORK", "solve_universe"]

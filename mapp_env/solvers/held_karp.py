@@ -1,0 +1,157 @@
+"""The shortest way of one agent through every set of landmarks, by dynamic programming.
+
+Held and Karp 1962, doi:10.1137/0110015. A set is a number whose bit ``k`` stands for landmark
+``k``; so tables have ``2 ** K`` lines.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.compiled import kernel
+
+__all__ = ["FAR", "route_costs", "route_tables", "shortest_routes", "tours_within", "trace_route"]
+
+FAR = 1 << 29
+"""More than any route, and twice it is still an int32."""
+
+
+def route_tables(
+    distances: NDArray[np.int32], closed: bool
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return, for each set, the steps to each of its landmarks as the last, and its cost.
+
+    Parameters
+    ----------
+    distances : ndarray of int32, shape (K + 1, K + 1)
+        Symmetric; node 0 is the depot.
+    closed : bool
+        Whether the way back to the depot counts.
+
+    Returns
+    -------
+    routes, costs : ndarray of int32, shape (2 ** K, K) and (2 ** K,)
+        From :func:`shortest_routes` and :func:`route_costs`.
+    """
+    n_landmarks = len(distances) - 1
+    routes = np.empty((1 << n_landmarks, n_landmarks), np.int32)
+    costs = np.empty(1 << n_landmarks, np.int32)
+    shortest_routes(distances, routes)
+    route_costs(distances, routes, closed, costs)
+    return routes, costs
+
+
+@kernel
+def shortest_routes(distances: NDArray[np.int32], routes: NDArray[np.int32]) -> None:
+    """Fill in the steps of the shortest way from the depot through each set of landmarks.
+
+    Parameters
+    ----------
+    distances : ndarray of int32, shape (K + 1, K + 1)
+        Symmetric; node 0 is the depot.
+    routes : ndarray of int32, shape (2 ** K, K)
+        ``routes[S, k]``: through all of S, ending on k; at least ``FAR`` if k is not in S.
+    """
+    n_landmarks = routes.shape[1]
+    routes[0] = FAR
+    for members in range(1, routes.shape[0]):
+        for last in range(n_landmarks):
+            bit = 1 << last
+            if members & bit == 0:
+                routes[members, last] = FAR
+            elif members == bit:
+                routes[members, last] = distances[0, last + 1]
+            else:
+                # Over all landmarks alike: those not in the set are far, and without a branch the
+                # loop takes eight at a time.
+                shorter = routes[members ^ bit]
+                steps = distances[last + 1]
+                least = np.int32(FAR)
+                for before in range(n_landmarks):
+                    least = min(least, np.int32(shorter[before] + steps[before + 1]))
+                routes[members, last] = least
+
+
+@kernel
+def route_costs(
+    distances: NDArray[np.int32],
+    routes: NDArray[np.int32],
+    closed: bool,
+    costs: NDArray[np.int32],
+) -> None:
+    """Fill in, for each set, the steps of one agent's shortest route, or closed tour, (2 ** K,)."""
+    costs[0] = 0
+    for members in range(1, costs.shape[0]):
+        least = np.int32(FAR)
+        for last in range(routes.shape[1]):
+            steps = routes[members, last]
+            if closed:
+                steps += distances[0, last + 1]
+            least = min(least, np.int32(steps))
+        costs[members] = least
+
+
+@kernel
+def tours_within(
+    distances: NDArray[np.int32],
+    routes: NDArray[np.int32],
+    closed: bool,
+    limit: int,
+    tours: NDArray[np.int32],
+) -> None:
+    """Fill in, for each set, the shortest closed tour within a limit, (2 ** K,), else ``FAR``.
+
+    The limit holds for the closed tour, or for the way to its last landmark only.
+    """
+    tours[0] = 0
+    for members in range(1, tours.shape[0]):
+        least = np.int32(FAR)
+        for last in range(routes.shape[1]):
+            steps = routes[members, last]
+            tour = steps + distances[0, last + 1]
+            if (tour if closed else steps) <= limit:
+                least = min(least, np.int32(tour))
+        tours[members] = least
+
+
+@kernel
+def trace_route(
+    distances: NDArray[np.int32],
+    routes: NDArray[np.int32],
+    closed: bool,
+    limit: int,
+    members: int,
+    route: NDArray[np.int32],
+) -> int:
+    """Write the landmarks of a set's shortest closed tour within a limit; return how many.
+
+    Among equals the tour that is first on its last landmark, then the lowest landmarks, from the
+    end backwards.
+    """
+    n_landmarks = routes.shape[1]
+    count = 0
+    for landmark in range(n_landmarks):
+        count += members >> landmark & 1
+    least = 2 * FAR
+    end = -1
+    for last in range(n_landmarks):
+        steps = routes[members, last]
+        tour = steps + distances[0, last + 1]
+        if (tour if closed else steps) <= limit:
+            shorter = tour < least or (tour == least and steps < routes[members, end])
+            if shorter:
+                least = tour
+                end = last
+    for place in range(count - 1, -1, -1):
+        route[place] = end
+        steps = routes[members, end]
+        members ^= 1 << end
+        for before in range(n_landmarks):
+            if (
+                members >> before & 1
+                and routes[members, before] + distances[before + 1, end + 1] == steps
+            ):
+                end = before
+                break
+    return count

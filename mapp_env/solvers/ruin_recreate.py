@@ -1,0 +1,320 @@
+"""Ruin and recreate: the iterations of the search, as kernels.
+
+Slack Induction by String Removals (Christiaens and Vanden Berghe 2020,
+doi:10.1287/trsc.2019.0914) with the longest route in its sights: an iteration takes strings of
+landmarks that lie close together out of the routes, and inserts each landmark again where it costs
+least. Differences from that paper:
+
+- cost is ``weight * longest route + sum of routes``; with plain greedy insertion under it, routes
+  level out;
+- the ruin starts from a landmark of the longest route three times out of four;
+- the temperature falls in cycles, each twice as long as the one before, so that neither a time nor
+  a number of iterations has to be known in advance, and more of them never make it worse.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.compiled import kernel
+
+__all__ = ["Layout", "Scratch", "Team", "improve"]
+
+PATIENCE = 5_000
+"""Iterations without a smaller total distance before a search ends whose cost is proven optimal."""
+
+MEAN_REMOVED = 10
+MAX_STRING = 10
+LONGEST_PERCENT = 75
+MEAN_BLINK = 100  # places tried between two that are skipped
+
+LOW_32_BITS = 0xFFFFFFFF
+FAR = 1 << 60
+
+# Places in `Search.memory`.
+WORD, COST, BEST, BEST_TOTAL, DONE, IMPROVED, CYCLE_END, CYCLE = range(8)
+# Places in `Search.heat`.
+NOW, FALL, WARMEST, COLDEST = range(4)
+
+
+class Layout(NamedTuple):
+    """What is searched: distances between nodes, the depot being node 0, a landmark 1 to K."""
+
+    distances: NDArray[np.int32]  # (K + 1, K + 1)
+    back: NDArray[np.int32]  # (K + 1,), what going home from a node counts: nothing on open routes
+    near: NDArray[np.int32]  # (K + 1, K), landmarks by distance from each node
+    weight: int  # of the longest route
+
+
+class Team(NamedTuple):
+    """One route per agent."""
+
+    routes: NDArray[np.int32]  # (N, K)
+    sizes: NDArray[np.int64]  # (N,)
+    lengths: NDArray[np.int64]  # (N,)
+
+
+class Scratch(NamedTuple):
+    """What one iteration needs."""
+
+    holder: NDArray[np.int64]  # (K + 1,), the agent that visits a node, -1 if none
+    removed: NDArray[np.int64]  # (K,)
+    keys: NDArray[np.int64]  # (K,)
+    touched: NDArray[np.bool_]  # (N,), whether a route differs from the one before
+
+
+@kernel
+def improve(
+    iterations: int,
+    bound: int,
+    layout: Layout,
+    now: Team,
+    trial: Team,
+    best: Team,
+    scratch: Scratch,
+    memory: NDArray[np.int64],
+    heat: NDArray[np.float64],
+) -> bool:
+    """Carry out iterations; return False if there is nothing left to improve.
+
+    ``trial`` equals ``now`` between iterations.
+    """
+    n_routes = now.sizes.shape[0]
+    for _ in range(iterations):
+        if memory[BEST] <= bound and (
+            layout.weight == 0 or memory[DONE] - memory[IMPROVED] >= PATIENCE
+        ):
+            return False
+        if memory[DONE] == memory[CYCLE_END]:
+            # From hot to cold, in twice as many iterations as last time.
+            memory[CYCLE_END] += memory[CYCLE]
+            heat[NOW] = heat[WARMEST]
+            heat[FALL] = math.exp(math.log(heat[COLDEST] / heat[WARMEST]) / memory[CYCLE])
+            memory[CYCLE] *= 2
+        if memory[DONE] == 0:
+            count = layout.near.shape[1]
+            for index in range(count):
+                scratch.removed[index] = index + 1
+        else:
+            count = ruin(layout, trial, scratch, memory)
+        sort_removed(count, layout, scratch, memory)
+        recreate(count, layout, trial, scratch, memory)
+        cost = cost_of(layout, trial)
+        chance = (1 + draw(memory, 1 << 30)) / ((1 << 30) + 1)
+        if cost < memory[COST] - heat[NOW] * math.log(chance):
+            memory[COST] = cost
+            copy_touched(trial, now, scratch.touched)
+            record(layout, now, best, memory)
+        else:
+            copy_touched(now, trial, scratch.touched)
+            for agent in range(n_routes):
+                if scratch.touched[agent]:
+                    for place in range(now.sizes[agent]):
+                        scratch.holder[now.routes[agent, place]] = agent
+        scratch.touched[:] = False
+        heat[NOW] *= heat[FALL]
+        memory[DONE] += 1
+    return True
+
+
+@kernel
+def draw(memory: NDArray[np.int64], span: int) -> int:
+    """Return a random integer in 0..span-1, for a span of at most 2**30.
+
+    A 32-bit PCG RXS-M-XS (O'Neill 2014, HMC-CS-2014-0905) in 64-bit signed arithmetic that never
+    overflows, so that it means the same with and without compilation.
+    """
+    state = (memory[WORD] * 747796405 + 2891336453) & LOW_32_BITS
+    memory[WORD] = state
+    state = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & LOW_32_BITS
+    return int((((state >> 22) ^ state) * span) >> 32)
+
+
+@kernel
+def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]) -> int:
+    """Take strings of landmarks near a random one out of their routes; return how many."""
+    n_landmarks = layout.near.shape[1]
+    wanted = min(1 + draw(memory, 2 * MEAN_REMOVED), n_landmarks)
+    if layout.weight > 0 and draw(memory, 100) < LONGEST_PERCENT:
+        longest = 0
+        for agent in range(team.sizes.shape[0]):
+            if team.lengths[agent] > team.lengths[longest]:
+                longest = agent
+        middle = int(team.routes[longest, draw(memory, team.sizes[longest])])
+    else:
+        middle = 1 + draw(memory, n_landmarks)
+    count = 0
+    for rank in range(n_landmarks):
+        if count >= wanted:
+            break
+        node = layout.near[middle, rank]
+        agent = scratch.holder[node]
+        if agent < 0:
+            continue
+        route = team.routes[agent]
+        size = team.sizes[agent]
+        string = 1 + draw(memory, min(MAX_STRING, size))
+        string = min(string, wanted - count)
+        place = 0
+        while route[place] != node:
+            place += 1
+        # The string holds the node anywhere.
+        low = max(place - string + 1, 0)
+        high = min(place, size - string)
+        start = low + draw(memory, high - low + 1)
+        for index in range(start, start + string):
+            scratch.removed[count] = route[index]
+            scratch.holder[route[index]] = -1
+            count += 1
+        for index in range(start + string, size):
+            route[index - string] = route[index]
+        team.sizes[agent] = size - string
+        length = 0
+        last = 0
+        for index in range(size - string):
+            length += layout.distances[last, route[index]]
+            last = route[index]
+        team.lengths[agent] = length + layout.back[last]
+        scratch.touched[agent] = True
+    return count
+
+
+@kernel
+def sort_removed(count: int, layout: Layout, scratch: Scratch, memory: NDArray[np.int64]) -> None:
+    """Put what was removed in the order in which it will be inserted."""
+    # By chance, far from the depot first (twice as rarely), near first, or as removed (rarer yet).
+    mode = draw(memory, 8)
+    if mode == 7:
+        return
+    removed = scratch.removed
+    keys = scratch.keys
+    for index in range(count):
+        if mode < 4:
+            keys[index] = draw(memory, 1 << 30)
+        elif mode < 6:
+            keys[index] = -layout.distances[0, removed[index]]
+        else:
+            keys[index] = layout.distances[0, removed[index]]
+    for index in range(1, count):
+        node = removed[index]
+        key = keys[index]
+        place = index
+        while place > 0 and keys[place - 1] > key:
+            keys[place] = keys[place - 1]
+            removed[place] = removed[place - 1]
+            place -= 1
+        keys[place] = key
+        removed[place] = node
+
+
+@kernel
+def recreate(
+    count: int, layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
+) -> None:
+    """Insert what was removed, each where it costs least, a few places being overlooked."""
+    n_routes = team.sizes.shape[0]
+    distances = layout.distances
+    top = 0
+    for agent in range(n_routes):
+        top = max(top, team.lengths[agent])
+    blink = 1 + draw(memory, 2 * MEAN_BLINK)
+    for index in range(count):
+        node = scratch.removed[index]
+        least = FAR
+        chosen = 0
+        chosen_place = 0
+        tried_empty = False
+        for agent in range(n_routes):
+            size = team.sizes[agent]
+            if size == 0:
+                if tried_empty:
+                    continue  # all empty routes are alike
+                tried_empty = True
+            before = 0
+            for place in range(size + 1):
+                detour = distances[node, before]
+                if place < size:
+                    after = team.routes[agent, place]
+                    detour += distances[node, after] - distances[before, after]
+                    before = after
+                else:
+                    detour += layout.back[node] - layout.back[before]
+                blink -= 1
+                if blink <= 0 and least < FAR:
+                    blink = 1 + draw(memory, 2 * MEAN_BLINK)
+                    continue
+                excess = max(team.lengths[agent] + detour - top, 0)
+                cost = detour + layout.weight * excess
+                if cost < least:
+                    least = cost
+                    chosen = agent
+                    chosen_place = place
+        route = team.routes[chosen]
+        size = team.sizes[chosen]
+        before = route[chosen_place - 1] if chosen_place > 0 else 0
+        detour = distances[node, before]
+        if chosen_place < size:
+            after = route[chosen_place]
+            detour += distances[node, after] - distances[before, after]
+        else:
+            detour += layout.back[node] - layout.back[before]
+        for place in range(size, chosen_place, -1):
+            route[place] = route[place - 1]
+        route[chosen_place] = node
+        team.sizes[chosen] = size + 1
+        team.lengths[chosen] += detour
+        top = max(top, team.lengths[chosen])
+        scratch.holder[node] = chosen
+        scratch.touched[chosen] = True
+
+
+@kernel
+def cost_of(layout: Layout, team: Team) -> int:
+    """Return what the search minimises."""
+    top = 0
+    total = 0
+    for agent in range(team.sizes.shape[0]):
+        top = max(top, team.lengths[agent])
+        total += team.lengths[agent]
+    return int(layout.weight * top + total)
+
+
+@kernel
+def record(layout: Layout, team: Team, best: Team, memory: NDArray[np.int64]) -> None:
+    """Keep a team that is better in the objective, or as good and shorter in all."""
+    top = 0
+    total = 0
+    for agent in range(team.sizes.shape[0]):
+        size = team.sizes[agent]
+        top = max(top, team.lengths[agent])
+        if size > 0:
+            last = team.routes[agent, size - 1]
+            total += team.lengths[agent] - layout.back[last] + layout.distances[0, last]
+    primary = top if layout.weight > 0 else total
+    if primary < memory[BEST] or (primary == memory[BEST] and total < memory[BEST_TOTAL]):
+        memory[BEST] = primary
+        memory[BEST_TOTAL] = total
+        memory[IMPROVED] = memory[DONE]
+        for agent in range(team.sizes.shape[0]):
+            copy_route(team, best, agent)
+
+
+@kernel
+def copy_touched(source: Team, target: Team, touched: NDArray[np.bool_]) -> None:
+    """Copy the routes that differ."""
+    for agent in range(touched.shape[0]):
+        if touched[agent]:
+            copy_route(source, target, agent)
+
+
+@kernel
+def copy_route(source: Team, target: Team, agent: int) -> None:
+    """Copy one agent's route."""
+    for place in range(source.sizes[agent]):
+        target.routes[agent, place] = source.routes[agent, place]
+    target.sizes[agent] = source.sizes[agent]
+    target.lengths[agent] = source.lengths[agent]
