@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from mapp_env.files import FileError, check_writable, write_bytes
 from mapp_env.rendering.ground import NOT_VISITED, Signs, draw_ground
 from mapp_env.rendering.palette import INK, WALL, agent_colour, to_hex
 from mapp_env.rendering.routes import DASHES, draw_routes
@@ -20,9 +24,14 @@ if TYPE_CHECKING:
     from mapp_env.plan import Plan
     from mapp_env.problem import Problem
 
-__all__ = ["draw_plan"]
+__all__ = ["FORMATS", "Panel", "costs_of", "draw_plan", "save_figure"]
+
+FORMATS = (".png", ".svg", ".pdf")
+MAX_BYTES = 1 << 28
 
 MAX_CELL, MAX_SMALL_SIDE, MAX_LARGE_SIDE, MIN_WIDTH = 0.75, 5.25, 9.0, 5.9  # inches
+MARGIN = 0.15  # inches
+DPI = 120
 LEGEND_COLUMNS = 3
 
 
@@ -54,7 +63,8 @@ def draw_plan(
     """
     grid = problem.grid
     if ax is None:
-        ax = _new_axes(grid, len(plan.tours))
+        panel = Panel(grid, len(plan.tours))
+        ax = panel.add_axes(Figure(figsize=panel.size, dpi=DPI))
     _prepare(ax, grid)
     points = _points_per_cell(ax, grid)
     claimed = {cell for cells in plan.claims for cell in cells}
@@ -69,25 +79,93 @@ def draw_plan(
             signs.frame(cell)
         signs.flag(cell)
     _draw_legend(ax, plan, len(claimed) < len(problem.landmarks))
-    title = _costs(plan) if title is None else title
+    title = costs_of(plan) if title is None else title
     if title:
         ax.set_title(title, fontsize=11, color=to_hex(INK))
     return ax
 
 
-def _new_axes(grid: Grid, n_agents: int) -> Axes:
-    # Laid out by hand, in inches: matplotlib's layout engines leave large gaps around axes that
-    # keep their cells square.
-    longest = max(grid.rows, grid.cols)
-    cell = min(MAX_CELL, (MAX_SMALL_SIDE if longest <= 12 else MAX_LARGE_SIDE) / longest)
-    across, down = cell * grid.cols, cell * grid.rows
-    margin, above = 0.15, 0.4
-    below = 0.15 + 0.19 * (math.ceil(n_agents / LEGEND_COLUMNS) + 1)
-    width, height = max(across, MIN_WIDTH) + 2 * margin, above + down + below
-    figure = Figure(figsize=(width, height), dpi=120)
-    return figure.add_axes(
-        ((width - across) / 2 / width, below / height, across / width, down / height)
-    )
+@dataclass(frozen=True)
+class Panel:
+    """The room that a plan takes in a figure, in inches.
+
+    Laid out by hand: matplotlib's layout engines leave large gaps around axes that keep their cells
+    square.
+
+    Parameters
+    ----------
+    grid : Grid
+        What is drawn.
+    n_agents : int
+        Entries of the legend.
+    large_side : float
+        Of the map, if it has many cells.
+    above : float
+        Room for the title.
+    """
+
+    grid: Grid
+    n_agents: int
+    large_side: float = MAX_LARGE_SIDE
+    above: float = 0.4
+
+    @property
+    def map_size(self) -> tuple[float, float]:
+        """Width and height of the map alone."""
+        longest = max(self.grid.rows, self.grid.cols)
+        side = MAX_SMALL_SIDE if longest <= 12 else self.large_side
+        cell = min(MAX_CELL, side / longest)
+        return cell * self.grid.cols, cell * self.grid.rows
+
+    @property
+    def below(self) -> float:
+        """Height of the legend."""
+        return 0.15 + 0.19 * (math.ceil(self.n_agents / LEGEND_COLUMNS) + 1)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height of all."""
+        across, down = self.map_size
+        return max(across, MIN_WIDTH) + 2 * MARGIN, self.above + down + self.below
+
+    def add_axes(self, figure: Figure, left: float = 0.0, bottom: float = 0.0) -> Axes:
+        """Return new axes for the map, in a panel with its corner at a point of a figure."""
+        width, height = figure.get_size_inches()
+        across, down = self.map_size
+        left += (self.size[0] - across) / 2
+        bottom += self.below
+        return figure.add_axes((left / width, bottom / height, across / width, down / height))
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> int:
+    """Write a figure, whole or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        What is written.
+    path : str or os.PathLike
+        The file, ``.png``, ``.svg`` or ``.pdf``; replaced if it is there.
+
+    Returns
+    -------
+    int
+        Size of the file in bytes.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be written.
+    """
+    check_writable(path)
+    suffix = os.path.splitext(os.fspath(path))[1].lower()
+    if suffix not in FORMATS:
+        raise FileError(f"{os.fspath(path)}: must end in {', '.join(FORMATS)}")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=suffix[1:])
+    data = buffer.getvalue()
+    write_bytes(path, data, MAX_BYTES)
+    return len(data)
 
 
 def _prepare(ax: Axes, grid: Grid) -> None:
@@ -143,7 +221,8 @@ def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
     )
 
 
-def _costs(plan: Plan) -> str:
+def costs_of(plan: Plan) -> str:
+    """Return a plan's three costs in words, the one that is proven optimal marked."""
     if not plan.success:
         return "not every landmark is visited"
     parts = []
