@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import os
 import zlib
 from collections.abc import Iterable, Iterator
@@ -172,31 +171,28 @@ def _checked(frames: Iterable[Frame], n_frames: int | None) -> Iterator[Frame]:
     except TypeError:
         raise ValueError(f"frames must be an iterable, got {describe(frames)}") from None
     shape = None
-    for count in itertools.count(1):
-        frame = next(source, None)
-        if frame is None and count > 1:
-            return
-        if frame is None:
-            raise ValueError("frames must hold at least one frame, got none")
+    for index, frame in enumerate(source):
         picture = isinstance(frame, np.ndarray) and frame.dtype == np.uint8 and frame.ndim == 3
         if not picture or frame.shape[2] != 3 or frame.size == 0 or max(frame.shape) > 65535:
             raise ValueError(
-                f"frames[{count - 1}] must be a uint8 array of shape (height, width, 3), "
+                f"frames[{index}] must be a uint8 array of shape (height, width, 3), "
                 f"got {describe(frame)}"
             )
         shape = shape or frame.shape
         if frame.shape != shape:
             raise ValueError(
-                f"frames[{count - 1}] must have the shape of the first, {shape}, got {frame.shape}"
+                f"frames[{index}] must have the shape of the first, {shape}, got {frame.shape}"
             )
         pixels = shape[0] * shape[1]
         allowed = min(MAX_FRAMES, MAX_PIXELS // pixels)
-        if max(count, n_frames or 0) > allowed:
+        if max(index + 1, n_frames or 0) > allowed:
             raise ValueError(
                 f"an animation of {shape[1]} x {shape[0]} pixels may have {allowed} frames, "
                 f"got {n_frames or 'more'}"
             )
         yield frame
+    if shape is None:
+        raise ValueError("frames must hold at least one frame, got none")
 
 
 # -- writing -------------------------------------------------------------------
