@@ -148,6 +148,6 @@ def test_wrong_paths_are_refused(
 ) -> None:
     """A path that cannot be written, or names no known format, is a ValueError; nothing is left."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match="must end in|cannot be written|not a regular file"):
+    with pytest.raises(ValueError, match=r"must end in|cannot be written|not a regular file"):
         compare_plans(PROBLEM, {"a": OPTIMUM}, name)
     assert not list(tmp_path.iterdir())

@@ -30,14 +30,15 @@ from mapp_env.commands.problem_options import (
 )
 from mapp_env.files import check_writable
 from mapp_env.plan import OBJECTIVES, Plan, replay
-from mapp_env.problem import MAX_CYCLES, Problem
+from mapp_env.problem import Problem
 from mapp_env.solvers import solve
 from mapp_env.validation import MAX_SEED, check_count, describe
 
 __all__ = ["add_arguments", "run"]
 
 ANIMATIONS, FIGURES = (".gif",), (".png", ".svg", ".pdf")
-FPS, MAX_STEPS = 4.0, 50
+FPS, STEPS = 4.0, 50
+MAX_STEPS = 1_999  # an animation may have one frame more
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what the optimum minimises (default cover_time)",
     )
     parser.add_argument(
-        "--max-cycles", type=int, metavar="T", help=f"steps of random at most (default {MAX_STEPS})"
+        "--max-cycles", type=int, metavar="T", help=f"steps of random at most (default {STEPS})"
     )
     parser.add_argument(
         "--fps", type=float, metavar="F", help=f"frames a second of a GIF (default {FPS:g})"
@@ -115,8 +116,8 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
     seed = check_count("--seed", 0 if arguments.seed is None else arguments.seed, 0, MAX_SEED)
     if source == "optimum":
         return problem, solve(problem, arguments.objective or "cover_time", seed=seed)
-    limit = MAX_STEPS if arguments.max_cycles is None else arguments.max_cycles
-    problem = replace(problem, max_cycles=check_count("--max-cycles", limit, 1, MAX_CYCLES))
+    limit = STEPS if arguments.max_cycles is None else arguments.max_cycles
+    problem = replace(problem, max_cycles=check_count("--max-cycles", limit, 1, MAX_STEPS))
     generator, _ = seeding.np_random(seed)
     return problem, replay(problem, generator.integers(0, 4, (limit, problem.n_agents)))
 

@@ -24,7 +24,7 @@ __all__ = ["DASHES", "draw_routes"]
 
 ARROWS_APART = 20.0  # points, at least
 LEAST_WIDTH, MOST_WIDTH = 0.9, 2.4  # points, of a line
-LANES = 0.46  # cells, from the middle of a corridor to where the outermost lane ends
+LANES = 0.42  # cells, from the middle of a corridor to where the outermost lane ends
 LANE = 0.13  # cells, of a lane where there is room for more
 LEAST_LANE = 2.4  # points, of a lane if there is room for it
 HOME_PALER = 0.3
