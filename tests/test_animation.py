@@ -272,6 +272,14 @@ def test_wrong_arguments_are_refused(
     assert not list(tmp_path.iterdir())
 
 
+def test_a_missing_folder_is_refused_before_any_frame_is_made(tmp_path: Path) -> None:
+    """A slip in the path costs no episode: frames are not even asked for."""
+    frames = iter(noise(2))
+    with pytest.raises(ValueError, match="cannot be written"):
+        save_gif(tmp_path / "no" / "a.gif", frames)
+    assert len(list(frames)) == 2
+
+
 def test_too_long_an_episode_is_refused_at_its_first_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -130,14 +130,19 @@ def test_the_objective_is_minimised(
     folder: Path, capsys: pytest.CaptureFixture[str], objective: str
 ) -> None:
     """The optimum is that of the objective asked for."""
-    assert main(["render", "--out", "a.gif", "--landmarks", "0,0", "48", "--n-agents", "1"]) == 0
-    capsys.readouterr()
     options = ["--landmarks", *LANDMARKS, "--objective", objective]
     assert main(["render", "--out", "a.gif", *options]) == 0
     problem = mapp_env.Problem(mapp_env.make_grid(), tuple(map(int, LANDMARKS)))
     words = objective.replace("_", " ")
     cost = int(mapp_env.solve(problem, objective).cost)
     assert re.search(rf"{words} {cost}\b.*; the {words} is proven optimal", capsys.readouterr().out)
+
+
+def test_cells_are_numbers_or_rows_and_columns(folder: Path) -> None:
+    """A landmark's cell may be given either way."""
+    for name, cells in (("a.gif", ["6", "47"]), ("b.gif", ["0,6", "6,5"])):
+        assert main(["render", "--out", name, "--landmarks", *cells]) == 0
+    assert (folder / "a.gif").read_bytes() == (folder / "b.gif").read_bytes()
 
 
 def test_random_play_is_seeded_and_limited(

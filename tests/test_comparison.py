@@ -107,10 +107,10 @@ def test_it_is_written(tmp_path: Path, suffix: str) -> None:
 
 def test_labels_are_taken_as_they_are() -> None:
     """A label is no formula, and one that is too long is cut."""
-    figure = compare_plans(PROBLEM, {"$\\frac{": OPTIMUM, "x" * 1000: OPTIMUM})
+    figure = compare_plans(PROBLEM, {"$\\frac{$": OPTIMUM, "x" * 1000: OPTIMUM})
     figure.draw_without_rendering()
     (first, _), (second, _) = headings(figure)
-    assert first == "$\\frac{"
+    assert first == "$\\frac{$"
     assert len(second) <= 60
 
 
