@@ -8,10 +8,10 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from PIL import Image
 
 import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.rendering import save_gif
 
 
 def spread_out(grid: mapp_env.Grid, state: np.ndarray, n_agents: int) -> list[int]:
@@ -48,9 +48,8 @@ def main() -> None:
     metrics = infos["agent_0"]["metrics"]
     env.close()
 
-    first, *rest = (Image.fromarray(frame) for frame in frames)
-    first.save(arguments.out, save_all=True, append_images=rest, duration=400, loop=0)
-    print(f"wrote {arguments.out}: {len(frames)} pictures, {metrics}")
+    size = save_gif(arguments.out, frames)
+    print(f"wrote {arguments.out}: {len(frames)} pictures, {size} bytes, {metrics}")
 
 
 if __name__ == "__main__":

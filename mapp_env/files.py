@@ -22,8 +22,10 @@ __all__ = [
     "MAX_PROBLEM_BYTES",
     "FileError",
     "Record",
+    "check_writable",
     "read_bytes",
     "read_record",
+    "write_bytes",
     "write_record",
     "write_text",
 ]
@@ -286,13 +288,18 @@ def write_record(
 
 
 def write_text(path: str | os.PathLike[str], text: str, limit: int) -> None:
-    """Write a text file whole or not at all: beside it first, then in its place.
+    """Write a text file as :func:`write_bytes` does."""
+    write_bytes(path, text.encode("utf-8"), limit)
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes, limit: int) -> None:
+    """Write a file whole or not at all: beside it first, then in its place.
 
     Parameters
     ----------
     path : str or os.PathLike
         The file; if it is there it must be a regular one, and is replaced.
-    text : str
+    data : bytes
         Its content.
     limit : int
         Largest size in bytes.
@@ -300,23 +307,40 @@ def write_text(path: str | os.PathLike[str], text: str, limit: int) -> None:
     Raises
     ------
     FileError
-        If the text is too large or the file cannot be written; an earlier file is left as it was.
+        If there is too much or the file cannot be written; an earlier file is left as it was.
+    """
+    target = check_writable(path)
+    if len(data) > limit:
+        raise FileError(f"{os.fspath(path)}: would have {len(data)} bytes, allowed are {limit}")
+    try:
+        _replace(target, data)
+    except (OSError, ValueError) as error:
+        raise FileError(f"{describe(path)}: cannot be written: {error}") from error
+
+
+def check_writable(path: str | os.PathLike[str]) -> str:
+    """Return what a path leads to, if a file could stand there.
+
+    For what takes long to make, so that a slip of the pen is noticed before.
+
+    Raises
+    ------
+    FileError
+        If it is no path, its folder is not there, or something else than a file is there already.
     """
     if not isinstance(path, str | os.PathLike):
         raise FileError(f"path must be a str or os.PathLike, got {describe(path)}")
-    data = text.encode("utf-8")
-    if len(data) > limit:
-        raise FileError(f"{os.fspath(path)}: would have {len(data)} bytes, allowed are {limit}")
     try:
         # A link stays a link: what it leads to is replaced.
         target = os.path.realpath(path)
         if os.path.exists(target) and not os.path.isfile(target):
             raise FileError(f"{os.fspath(path)}: is there and not a regular file")
-        _replace(target, data)
+        os.stat(os.path.dirname(target))
     except (OSError, ValueError) as error:
         if isinstance(error, FileError):
             raise
         raise FileError(f"{describe(path)}: cannot be written: {error}") from error
+    return os.fspath(target)
 
 
 def _replace(target: str, data: bytes) -> None:

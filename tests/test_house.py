@@ -29,9 +29,12 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("solvers",),
     ("rows", "row_seeds", "display"),
     ("simulation",),
+    ("rendering.animation",),
     ("parallel_env", "central_env", "vector_env"),
     ("mapp_v0",),
     ("__init__",),
+    ("commands",),
+    ("__main__",),
 )
 FACES = {"parallel_env", "central_env", "vector_env", "mapp_v0", "__init__"}
 DRAWING = {"PIL", "matplotlib", "pygame"}
@@ -46,11 +49,11 @@ def module_name(path: Path) -> str:
 
 
 def layer(module: str) -> int:
-    """Return how high a module stands."""
-    top = module.split(".")[0]
-    for level, names in enumerate(LAYERS):
-        if top in names:
-            return level
+    """Return how high a module stands: where it is listed itself, else where its package is."""
+    for name in (module, module.split(".")[0]):
+        for level, names in enumerate(LAYERS):
+            if name in names:
+                return level
     raise AssertionError(f"{module} has no place in LAYERS: give it one")
 
 

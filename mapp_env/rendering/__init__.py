@@ -1,8 +1,11 @@
 """Pictures of episodes and plans; a drawing library is loaded by the first picture that needs it.
 
 ``Scene`` is what a picture shows. ``ansi(scene)`` draws it as text, ``rgb_array(scene)`` as pixels
-(Pillow), ``Window`` shows pixels on the screen (pygame-ce), and ``draw_plan(problem, plan)`` draws
-the routes of a plan (matplotlib).
+(Pillow), ``Window`` shows pixels on the screen (pygame-ce). ``save_animation(path, problem,
+joint_actions)`` plays an episode into an animated GIF, and ``save_gif(path, frames)`` writes the
+frames of a running environment (Pillow). ``draw_plan(problem, plan)`` draws the routes of a plan,
+``compare_plans(problem, plans)`` several side by side, and ``save_figure(figure, path)`` keeps them
+(matplotlib).
 """
 
 from __future__ import annotations
@@ -17,14 +20,30 @@ from mapp_env.rendering.rgb_array import rgb_array
 from mapp_env.scene import Scene
 
 if TYPE_CHECKING:
-    from mapp_env.rendering.figures import draw_plan
+    from mapp_env.rendering.animation import save_animation, save_gif
+    from mapp_env.rendering.comparison import compare_plans
+    from mapp_env.rendering.figures import draw_plan, save_figure
     from mapp_env.rendering.human import Window
 
-__all__ = ["Scene", "Window", "ansi", "draw_plan", "rgb_array"]
+__all__ = [
+    "Scene",
+    "Window",
+    "ansi",
+    "compare_plans",
+    "draw_plan",
+    "rgb_array",
+    "save_animation",
+    "save_figure",
+    "save_gif",
+]
 
 _LAZY = {
     "Window": "mapp_env.rendering.human",
+    "compare_plans": "mapp_env.rendering.comparison",
     "draw_plan": "mapp_env.rendering.figures",
+    "save_animation": "mapp_env.rendering.animation",
+    "save_figure": "mapp_env.rendering.figures",
+    "save_gif": "mapp_env.rendering.animation",
 }
 
 
@@ -32,7 +51,14 @@ def __getattr__(name: str) -> Any:
     """Load the file of a lazy name on its first use."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_LAZY[name]), name)
+    try:
+        value = getattr(importlib.import_module(_LAZY[name]), name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] != "matplotlib":
+            raise
+        raise ImportError(
+            f'{name} needs matplotlib: pip install "mapp_env[figures]"', name="matplotlib"
+        ) from error
     globals()[name] = value
     return value
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["rgb_array"]
 
-MAX_SIDE = 1024  # pixels of the longer side of the grid, margins and bar not counted
+MAX_SIDE = 1024  # default pixels of the longer side of the grid, margins and bar not counted
 MAX_CELL = 72
 MIN_AREA = (
     240,
@@ -53,7 +53,7 @@ Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
 _Place: TypeAlias = tuple[float, float, int]  # an agent's middle, down and right, and its diameter
 
 
-def rgb_array(scene: Scene) -> Frame:
+def rgb_array(scene: Scene, max_side: int = MAX_SIDE) -> Frame:
     """Draw a scene as pixels.
 
     Flags are red until visited, then pale with a check mark. Agents are discs with their number;
@@ -65,13 +65,16 @@ def rgb_array(scene: Scene) -> Frame:
     ----------
     scene : Scene
         The moment to show.
+    max_side : int
+        Pixels that the longer side of the grid may take; cells are made smaller for it, down to one
+        pixel.
 
     Returns
     -------
     ndarray of uint8, shape (height, width, 3)
         A fresh array; height and width are even, as video encoders want.
     """
-    layout = _layout(scene.grid, len(scene.landmarks), scene.max_cycles)
+    layout = _layout(scene.grid, len(scene.landmarks), scene.max_cycles, max_side)
     frame = _background(scene.grid, layout).copy()
     _draw_flag_cells(frame, layout, scene)
     _draw_trails(frame, layout, scene)
@@ -128,8 +131,8 @@ class _Layout:
 
 
 @lru_cache(maxsize=64)
-def _layout(grid: Grid, n_landmarks: int, max_cycles: int) -> _Layout:
-    cell = min(MAX_CELL, MAX_SIDE // max(grid.rows, grid.cols))
+def _layout(grid: Grid, n_landmarks: int, max_cycles: int, max_side: int) -> _Layout:
+    cell = max(min(MAX_CELL, max_side // max(grid.rows, grid.cols)), 1)
     # The widest texts that the bar will ever show in this episode.
     left, right = _status_texts(max_cycles, max_cycles, n_landmarks, n_landmarks)
     bar_width = sum(icons.text(part, TEXT, PAPER).shape[1] for part in (left, right)) + 2 * BAR

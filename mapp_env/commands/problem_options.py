@@ -1,0 +1,115 @@
+"""The options that say which problem a command is about."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+
+from mapp_env.grid import Grid
+from mapp_env.grids import generator_names, grid_names, make_grid
+from mapp_env.problem import Problem, sample_problems
+from mapp_env.task import find_grid
+from mapp_env.validation import describe
+
+__all__ = ["add_problem_options", "problem_of", "refuse_problem_options"]
+
+GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
+
+
+def add_problem_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to a command's parser; those not given are ``None``."""
+    group = parser.add_argument_group("the problem")
+    group.add_argument(
+        "--grid",
+        metavar="GRID",
+        help=f"a bundled grid ({', '.join(grid_names())}), a generator "
+        f"({', '.join(generator_names())}) or a map file (default {GRID})",
+    )
+    group.add_argument("--rows", type=int, metavar="R", help="rows of a generated grid")
+    group.add_argument("--cols", type=int, metavar="C", help="columns of a generated grid")
+    group.add_argument(
+        "--grid-seed", type=int, metavar="S", help="which of the generated grids (default 0)"
+    )
+    group.add_argument(
+        "--landmarks",
+        nargs="+",
+        type=_cell,
+        metavar="CELL",
+        help="their cells, as numbers (row * columns + column) or ROW,COL (default: drawn)",
+    )
+    group.add_argument(
+        "--n-landmarks", type=int, metavar="K", help=f"how many to draw (default {N_LANDMARKS})"
+    )
+    group.add_argument("--n-agents", type=int, metavar="N", help=f"default {N_AGENTS}")
+    group.add_argument(
+        "--seed", type=int, metavar="S", help="of all that is drawn, but for the grid (default 0)"
+    )
+
+
+def problem_of(arguments: argparse.Namespace) -> Problem:
+    """Return the problem that the options describe.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    grid = _grid_of(arguments)
+    n_agents = N_AGENTS if arguments.n_agents is None else arguments.n_agents
+    landmarks = arguments.landmarks
+    if landmarks is None:
+        count = N_LANDMARKS if arguments.n_landmarks is None else arguments.n_landmarks
+        seed = 0 if arguments.seed is None else arguments.seed
+        landmarks = sample_problems(grid, 1, n_landmarks=count, seed=seed)[0].tolist()
+    elif arguments.n_landmarks is not None:
+        raise ValueError("--n-landmarks is how many to draw: it does not go with --landmarks")
+    return Problem(grid, landmarks, n_agents)
+
+
+def refuse_problem_options(arguments: argparse.Namespace, reason: str) -> None:
+    """Refuse options that another source of the problem would leave without effect.
+
+    Raises
+    ------
+    ValueError
+        If one of them was given.
+    """
+    for name in ("grid", "rows", "cols", "grid_seed", "landmarks", "n_landmarks", "n_agents"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name.replace('_', '-')} does not go with {reason}")
+
+
+def _grid_of(arguments: argparse.Namespace) -> Grid:
+    name = GRID if arguments.grid is None else arguments.grid
+    options = {
+        option: value
+        for option, value in (
+            ("rows", arguments.rows),
+            ("cols", arguments.cols),
+            ("seed", arguments.grid_seed),
+        )
+        if value is not None
+    }
+    if name in generator_names():
+        return make_grid(name, **options)
+    if options:
+        raise ValueError(
+            "--rows, --cols and --grid-seed are for generated grids "
+            f"(--grid {' | '.join(generator_names())}), not for {describe(name)}"
+        )
+    if name not in grid_names() and not os.path.lexists(name):
+        raise ValueError(
+            f"--grid must be one of {', '.join((*grid_names(), *generator_names()))} or a map "
+            f"file, got {describe(name)}"
+        )
+    return find_grid(name)
+
+
+def _cell(text: str) -> int | tuple[int, ...]:
+    """Return a cell written as its number, or as row and column."""
+    parts = text.split(",")
+    if len(parts) > 2 or not all(re.fullmatch(r"[0-9]{1,9}", part) for part in parts):
+        raise argparse.ArgumentTypeError(f"{describe(text)} is neither a number nor ROW,COL")
+    numbers = tuple(map(int, parts))
+    return numbers[0] if len(numbers) == 1 else numbers
