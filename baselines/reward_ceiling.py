@@ -235,8 +235,10 @@ def format_row(label: str, found: list[CoverTimes], optimum: np.ndarray) -> str:
     solved = np.isfinite(worst)
     if not solved.any():
         return f"| {label:<9} | {0:8.2f} | {'-':>6} | {'-':>17} | {0:9.1f} | {'-':>11} |"
+    # Rounded, because a mean over ties can be off by the last bit, and -0.00 is no gap.
     gap, low, high = (
-        100 * float((times[solved] / optimum[solved] - 1).mean()) for times in (mean, best, worst)
+        100 * max(0.0, float((times[solved] / optimum[solved] - 1).mean().round(9)))
+        for times in (mean, best, worst)
     )
     largest = 100 * float((worst[solved] / optimum[solved] - 1).max())
     share = 100 * float((worst == optimum).mean())

@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("dynamics", "observation", "task", "rendering"),
     ("playing", "tour_checks", "walking"),
     ("plan",),
-    ("solvers",),
+    ("solvers", "rendering.comparison"),
     ("rows", "row_seeds", "display"),
     ("simulation",),
     ("rendering.animation",),
