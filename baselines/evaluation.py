@@ -300,7 +300,8 @@ def _format_cell(name: str, value: float) -> str:
     if not name.endswith("%"):
         return f"{value:.2f}"
     # 99.9998 % is not 100 %: rounded away from what would say too much.
-    whole = math.floor(value * 100) / 100 if name in ("solved %", "optimal %") else value
+    # (5.1 * 100 is 509.999...)
+    whole = math.floor(value * 100 + 1e-6) / 100 if name in ("solved %", "optimal %") else value
     return f"{whole:.2f}"
 
 

@@ -22,13 +22,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from baselines.checks import check_count
-from baselines.evaluation import N_ROUTES, Evaluation
+from baselines.evaluation import Evaluation
 from baselines.runs import METRICS_FILE, read_metrics
-from mapp_env import Plan, Problem, replay, solve
-from mapp_env.rendering import draw_plan
+from mapp_env import Problem, replay, solve
+from mapp_env.rendering import compare_plans
 
 DPI = 120
-PANEL_WIDTH, PANEL_HEIGHT = 6.2, 6.0  # inches, title and legend of a map of routes included
+ROUTES_FILES = ("fig4a_routes.png", "fig4b_routes.png")
 DRAWN_COLUMNS = ("episode", "problem", "steps", "reward")
 EPISODE_COLOUR = "#9db8d2"
 MEAN_COLOUR = "#123a63"
@@ -88,37 +88,21 @@ def _draw_curve(
     )
 
 
-def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
-    """Draw Fig. 4: the routes of the first two problems, a row each, beside the optimum.
+def draw_routes(folder: Path, evaluations: dict[str, Evaluation]) -> list[Path]:
+    """Draw Fig. 4: the routes of the first two problems, a file each, beside the optimum.
 
     The evaluations must have kept the actions of these. Nothing is chosen by how it came out: the
     problems are the first two of the evaluation, solved or not.
     """
     first = next(iter(evaluations.values()))
-    n_rows = min(N_ROUTES, len(first.landmarks))
+    names = ROUTES_FILES[: len(first.landmarks)]
     for label, evaluation in evaluations.items():
-        if evaluation.actions.shape[1] < n_rows:
+        if evaluation.actions.shape[1] < len(names):
             raise ValueError(
-                f"evaluations must have kept the actions of {n_rows} problems, {label!r} has "
+                f"evaluations must have kept the actions of {len(names)} problems, {label!r} has "
                 f"those of {evaluation.actions.shape[1]}"
             )
-    n_columns = len(evaluations) + 1
-    figure, grid_of_axes = plt.subplots(
-        n_rows,
-        n_columns,
-        figsize=(PANEL_WIDTH * n_columns, PANEL_HEIGHT * n_rows),
-        squeeze=False,
-    )
-    # By hand: layout engines shrink a square map to make room for the legend below it.
-    figure.subplots_adjust(
-        left=0.02,
-        right=0.98,
-        wspace=0.02,
-        top=1 - 0.55 / (PANEL_HEIGHT * n_rows),
-        bottom=0.8 / (PANEL_HEIGHT * n_rows),
-        hspace=1.35 / (PANEL_HEIGHT - 1.35),
-    )
-    for index, row in enumerate(grid_of_axes):
+    for index, name in enumerate(names):
         setting = first.setting
         landmarks = tuple(first.landmarks[index].tolist())
         problem = Problem(setting.grid, landmarks, setting.n_agents, setting.max_cycles)
@@ -128,18 +112,8 @@ def draw_routes(path: Path, evaluations: dict[str, Evaluation]) -> Path:
         }
         best = solve(problem)
         plans["optimum" if best.status == "optimal" else "best known"] = best
-        for axes, (label, plan) in zip(row, plans.items(), strict=True):
-            title = f"({'ab'[index]}) {label}\n{_outcome(problem, plan)}"
-            draw_plan(problem, plan, ax=axes, title=title)
-    return _save(figure, path)
-
-
-def _outcome(problem: Problem, plan: Plan) -> str:
-    """Say in a line what became of a problem."""
-    if plan.success:
-        return f"all visited in {plan.cover_time} steps, distance {plan.total_distance}"
-    n_visited = sum(len(claims) for claims in plan.claims)
-    return f"not solved: {n_visited} of {len(problem.landmarks)} visited"
+        compare_plans(problem, plans, folder / name)
+    return [folder / name for name in names]
 
 
 def _save(figure: Figure, path: Path) -> Path:

@@ -465,7 +465,7 @@ def main(args: Args) -> int:
             save_table(folder, evaluations)
             print(f"\n{len(unseen):,} unseen problems:\n\n{format_table(evaluations)}")
             shown = ("network alone", "network, guidance 1")
-            draw_routes(folder / "fig4_routes.png", {label: evaluations[label] for label in shown})
+            draw_routes(folder, {label: evaluations[label] for label in shown})
     except KeyboardInterrupt:
         print(f"stopped early; what there is so far is in {folder}", flush=True)
         return 128 + (signals.received or signal.SIGINT)

@@ -77,8 +77,9 @@ class Plan:
 
     @property
     def cost(self) -> float:
-        """The cost in :attr:`objective`."""
-        return float(getattr(self, self.objective))
+        """The cost in :attr:`objective`: a whole number, or infinite."""
+        cost: float = getattr(self, self.objective)
+        return cost
 
     # -- playing it --------------------------------------------------------------------
 

@@ -229,6 +229,11 @@ def sample_problems(
         tuple(sorted(check_landmarks(grid, landmarks, n_landmarks, f"exclude[{index}]")))
         for index, landmarks in enumerate(exclude)
     }
+    if n_landmarks > grid.reachable.size:
+        raise ValueError(
+            f"n_landmarks must be at most {grid.reachable.size}, the cells of this grid that may "
+            f"hold one; got {n_landmarks}"
+        )
     total = math.comb(grid.reachable.size, n_landmarks)
     if n_problems > total - len(seen):
         raise ValueError(

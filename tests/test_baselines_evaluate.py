@@ -229,3 +229,6 @@ def test_shares_are_never_rounded_up_to_all():
     """One problem unsolved in a hundred thousand does not show as 100 %."""
     assert evaluation_module._format_cell("solved %", 99.9999) == "99.99"
     assert evaluation_module._format_cell("optimal %", 100.0) == "100.00"
+    for tenths in range(1001):
+        share = 100.0 * (tenths / 1000)
+        assert evaluation_module._format_cell("solved %", share) == f"{tenths / 10:.2f}"

@@ -67,7 +67,8 @@ def test_run_leaves_all_it_promises(two_runs):
         "evaluation.md",
         "fig2_reward.png",
         "fig3_steps.png",
-        "fig4_routes.png",
+        "fig4a_routes.png",
+        "fig4b_routes.png",
         "metrics.csv",
         "policy.safetensors",
         "timing.json",
@@ -90,7 +91,7 @@ def test_run_leaves_all_it_promises(two_runs):
     assert float(rows[0]["guidance"]) == 1.0
     assert float(rows[-1]["loss"]) > 0
 
-    for name in ("fig2_reward.png", "fig3_steps.png", "fig4_routes.png"):
+    for name in ("fig2_reward.png", "fig3_steps.png", "fig4a_routes.png", "fig4b_routes.png"):
         assert (run / name).read_bytes().startswith(b"\x89PNG")
     timing = json.loads((run / "timing.json").read_text())
     assert timing["episodes"] == 6
@@ -263,7 +264,7 @@ def test_large_grid_has_no_nearest_landmark_row(tmp_path, capsys):
     assert output.count("no row for the nearest landmark: the grid has more than 4,096 cells") == 1
     rows = list(csv.reader((run / "evaluation.csv").read_text().splitlines()))
     assert [row[0] for row in rows[-2:]] == ["random, guidance 1", "optimum of each cost"]
-    assert (run / "fig4_routes.png").exists()
+    assert (run / "fig4b_routes.png").exists()
 
 
 @pytest.mark.parametrize(("n_problems", "left"), [(1, 35), (35, 1), (36, 0)])

@@ -88,6 +88,20 @@ def test_readmes_code_runs(tmp_path: Path) -> None:
         run([sys.executable, str(script)], tmp_path)
 
 
+@pytest.mark.parametrize("path", DOCUMENTS[1:], ids=lambda path: path.name)
+def test_pages_code_runs(path: Path, tmp_path: Path) -> None:
+    """A page's Python blocks run one after the other, and print what their comments say."""
+    blocks = python_blocks(path)
+    script = tmp_path / "page.py"
+    script.write_text("\n".join(blocks), encoding="utf-8")
+    printed = run([sys.executable, str(script)], tmp_path).splitlines()
+    promised = re.findall(r"^print\(.*\)  # (.*)$", "\n".join(blocks), re.MULTILINE)
+    assert len(printed) == len(promised)
+    for line, promise in zip(printed, promised, strict=True):
+        if promise[0].isdigit() or promise[0] in "[(":
+            assert line == promise
+
+
 def test_rules_table_names_what_exists() -> None:
     """Each rule's row names functions of the package and tests of the suite."""
     text = (REPOSITORY / "docs" / "env.md").read_text(encoding="utf-8")
