@@ -9,7 +9,6 @@ import os
 import reprlib
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import safetensors.torch
@@ -17,7 +16,7 @@ import torch
 
 from baselines.checks import check_count, check_observations, check_rows
 from baselines.networks import NetworkSpec, PaperNetwork, build_network
-from baselines.runs import WEIGHTS_FILE, read_bytes, write_atomically
+from baselines.runs import WEIGHTS_FILE, parse_json, read_bytes, write_atomically
 from mapp_env import Grid
 
 WEIGHTS_KEY = "mapp_env_policy"  # the one metadata entry of our safetensors files
@@ -207,15 +206,3 @@ def read_spec(file: Path, content: bytes) -> NetworkSpec:
         return NetworkSpec(**about)
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{file}: {error}") from error
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON, but refuse an entry that is there twice: two readers could differ on it."""
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        entries = dict(pairs)
-        if len(entries) != len(pairs):
-            raise ValueError("damaged header: an entry is there twice")
-        return entries
-
-    return json.loads(text, object_pairs_hook=unique)

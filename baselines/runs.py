@@ -7,6 +7,7 @@ config.json         every option, the training problems, versions, commit
 metrics.csv         one row per finished episode; flushed at every row
 policy.safetensors  the network's weights (``policy.load_policy`` reads them)
 timing.json         where the time went; the only file with wall times of the run
+checkpoints/        the last two checkpoints (``checkpoints.Checkpoints``)
 evaluation.csv/.md  the table over unseen problems
 fig*.png            the paper's figures 2, 3 and 4
 =================== ==============================================================
@@ -15,6 +16,7 @@ metrics.csv holds no wall time: two runs with one seed write the same bytes.
 """
 
 import csv
+import hashlib
 import json
 import os
 import platform
@@ -29,48 +31,69 @@ from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from types import FrameType, TracebackType
-from typing import Any, TextIO
+from typing import Any
+
+from filelock import FileLock, Timeout
 
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.csv"
 WEIGHTS_FILE = "policy.safetensors"
 TIMING_FILE = "timing.json"
+LOCK_FILE = ".lock"
 MAX_TEXT_BYTES = 64 * 1024 * 1024  # no file of ours comes near; refuse to read more
 
 VERSIONED = ("mapp_env", "numpy", "numba", "torch", "gymnasium", "pettingzoo", "safetensors")
 
 
 class RunFolder:
-    """A new folder for one training.
+    """The folder of one training, locked while it is open.
 
     Parameters
     ----------
     folder
-        Where; it must not exist, or be empty.
+        Where; it must not exist, or be empty, unless a run is resumed.
     columns
         The columns of metrics.csv.
+    resume
+        Whether to go on in a folder that a training has left.
 
     Raises
     ------
     ValueError
-        If the folder holds something already, or cannot be made.
+        If the folder holds something already (or, to resume, no run), cannot be made, or another
+        training has it open.
     """
 
-    def __init__(self, folder: Path, columns: Sequence[str]) -> None:
+    def __init__(self, folder: Path, columns: Sequence[str], resume: bool = False) -> None:
         self.folder = folder
         self.columns = tuple(columns)
+        if resume and not (folder / CONFIG_FILE).is_file():
+            raise ValueError(f"resume must be a run folder, got {str(folder)!r}")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            occupied = any(folder.iterdir())
+            occupied = not resume and any(folder.iterdir())
         except OSError as error:
             raise ValueError(f"out must be a folder that can be made: {error}") from error
         if occupied:
             raise ValueError(
                 f"out must be a new or empty folder, got {str(folder)!r}, which is not empty"
             )
-        self._metrics: TextIO = (folder / METRICS_FILE).open("w", newline="", encoding="utf-8")
+        self._lock = FileLock(folder / LOCK_FILE)
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise ValueError(f"{folder}: another training is writing into it") from None
+        except OSError as error:
+            raise ValueError(f"{folder}: cannot be written into: {error}") from error
+        mode = "r+" if resume else "w+"
+        try:
+            self._metrics = (folder / METRICS_FILE).open(mode, newline="", encoding="utf-8")
+        except OSError as error:
+            self._lock.release()
+            raise ValueError(f"{folder}: cannot be written into: {error}") from error
         self._writer = csv.writer(self._metrics, lineterminator="\n")
-        self._write_row(self.columns)
+        if not resume:
+            self._write_row(self.columns)
 
     def path(self, name: str) -> Path:
         """Where the file called `name` is in this run."""
@@ -93,9 +116,36 @@ class RunFolder:
         self._writer.writerow([f"{v:.9g}" if isinstance(v, float) else v for v in values])
         self._metrics.flush()
 
+    def position(self) -> dict[str, Any]:
+        """Force metrics.csv to the disk; return what is in it, for a checkpoint."""
+        os.fsync(self._metrics.fileno())
+        content = read_bytes(self.path(METRICS_FILE), MAX_TEXT_BYTES)
+        return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+    def rewind(self, position: Mapping[str, Any]) -> None:
+        """Cut metrics.csv back to where a checkpoint was written; what came later comes again.
+
+        Raises
+        ------
+        ValueError
+            If what was written before that has changed.
+        """
+        content = read_bytes(self.path(METRICS_FILE), MAX_TEXT_BYTES)[: position["bytes"]]
+        if hashlib.sha256(content).hexdigest() != position["sha256"]:
+            raise ValueError(f"{self.path(METRICS_FILE)}: changed since the checkpoint was written")
+        self._metrics.truncate(position["bytes"])
+        self._metrics.seek(position["bytes"])
+
+    def restart(self) -> None:
+        """Cut metrics.csv back to its header: no checkpoint had been written."""
+        self._metrics.seek(0)
+        self._metrics.truncate(0)
+        self._write_row(self.columns)
+
     def close(self) -> None:
-        """Close metrics.csv."""
+        """Close metrics.csv and release the folder."""
         self._metrics.close()
+        self._lock.release()
 
 
 def default_folder(algorithm: str, preset: str, seed: int) -> Path:
@@ -170,6 +220,26 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
     if len(content) > max_bytes:
         raise ValueError(f"{path}: larger than {max_bytes} bytes")
     return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON, but refuse an entry that is there twice: two readers could differ on it.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, or has an entry twice.
+    RecursionError
+        If it is nested too deeply.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        entries = dict(pairs)
+        if len(entries) != len(pairs):
+            raise ValueError("an entry is there twice")
+        return entries
+
+    return json.loads(text, object_pairs_hook=unique)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

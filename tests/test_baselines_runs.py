@@ -62,6 +62,7 @@ def test_run_leaves_all_it_promises(two_runs):
     folder, (output, _) = two_runs
     run = folder / "a"
     assert sorted(path.name for path in run.iterdir()) == [
+        ".lock",
         "config.json",
         "evaluation.csv",
         "evaluation.md",
