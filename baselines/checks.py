@@ -44,6 +44,18 @@ def check_choice(name: str, value: object, allowed: tuple[str, ...]) -> None:
         raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
 
 
+def check_flag(name: str, value: object) -> None:
+    """Refuse what is not True or False.
+
+    Raises
+    ------
+    ValueError
+        If `value` is anything else.
+    """
+    if not isinstance(value, bool):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
 def check_rows(observations: object) -> np.ndarray:
     """Return observations as a table of numbers, a row per problem.
 

@@ -24,7 +24,6 @@ from baselines.checks import check_count, check_number
 from baselines.evaluation import (
     EVALUATION_SEED,
     Evaluation,
-    Setting,
     count_problems,
     count_unseen,
     evaluate,
@@ -35,12 +34,8 @@ from baselines.evaluation import (
     unseen_problems,
 )
 from baselines.guidance import Acting, Guidance, GuidedPolicy
-from baselines.networks import NetworkSpec
 from baselines.policy import NearestLandmarkPolicy, RandomPolicy, load_policy
-from baselines.runs import CONFIG_FILE, read_config
-from mapp_env import Grid, Problem, grid_names, make_grid
-
-N_ACTIONS = 4
+from baselines.settings import N_ACTIONS, Setting, check_fits, find_grid, read_setting
 
 
 @dataclass
@@ -78,75 +73,6 @@ class Args:
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_number("guidance", self.guidance, 0.0, 1.0)
         check_count("threads", self.threads, 1, 1024)
-
-
-def find_grid(name: str) -> Grid:
-    """Return a bundled grid, or the one in a map file."""
-    return make_grid(name) if name in grid_names() else Grid.load(name)
-
-
-def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
-    """Read from a run folder what was trained: the setting, and the training problems.
-
-    Raises
-    ------
-    ValueError
-        If the run's config does not say it, or says what cannot be.
-    """
-    config = read_config(folder)
-    where = f"{folder / CONFIG_FILE}"
-    try:
-        options, rows = config["options"], config["training_problems"]
-        if not isinstance(options, dict) or not isinstance(rows, list):
-            raise ValueError("options must be an object, training_problems a list")
-        setting = Setting(
-            Grid.from_text(config["grid"]),
-            options["n_agents"],
-            options["n_landmarks"],
-            options["max_cycles"],
-        )
-        check_count("n_agents", setting.n_agents, 1, 16)
-        check_count("n_landmarks", setting.n_landmarks, 1, 256)
-        check_count("max_cycles", setting.max_cycles, 1, 1_000_000)
-    except KeyError as error:
-        raise ValueError(f"{where}: no entry {error}") from error
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {error}") from error
-    problems = []
-    for index, landmarks in enumerate(rows):
-        try:
-            cells = Problem(setting.grid, landmarks).landmarks
-        except ValueError as error:
-            raise ValueError(f"{where}: training_problems[{index}]: {error}") from error
-        if len(cells) != setting.n_landmarks:
-            raise ValueError(
-                f"{where}: training_problems[{index}]: must have {setting.n_landmarks} landmarks, "
-                f"got {len(cells)}"
-            )
-        problems.append(cells)
-    return setting, problems
-
-
-def check_fits(spec: NetworkSpec, setting: Setting, folder: Path) -> None:
-    """Refuse a run whose config and weights tell of different tasks.
-
-    Raises
-    ------
-    ValueError
-        If grid size, number of agents, landmarks or actions differ.
-    """
-    told = {
-        "n_cells": setting.grid.n_cells,
-        "n_agents": setting.n_agents,
-        "n_landmarks": setting.n_landmarks,
-        "n_actions": N_ACTIONS,
-    }
-    for name, value in told.items():
-        if getattr(spec, name) != value:
-            raise ValueError(
-                f"{folder}: {name} is {value} by {CONFIG_FILE}, and {getattr(spec, name)} by the "
-                "weights"
-            )
 
 
 def main(args: Args) -> None:

@@ -18,7 +18,8 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from baselines.checks import check_count
 from baselines.guidance import Acting
 from baselines.runs import write_atomically
-from mapp_env import Grid, Problem, make_vec, sample_problems, solve
+from baselines.settings import Setting
+from mapp_env import Problem, make_vec, sample_problems, solve
 from mapp_env.solvers import optimal_costs, solve_universe
 
 # Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
@@ -29,16 +30,6 @@ N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 MAX_BATCH_LANDMARKS = 12  # of optimal_costs()
 MAX_EXACT_LANDMARKS = 20  # of solve(method="exact")
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What the agents have to do, but for the landmarks' places."""
-
-    grid: Grid
-    n_agents: int = 3
-    n_landmarks: int = 5
-    max_cycles: int = 50
 
 
 # -- problems ----------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import safetensors.torch
 import torch
 
 from baselines.checks import check_count, check_observations, check_rows
-from baselines.networks import NetworkSpec, PaperNetwork, build_network
+from baselines.networks import Network, NetworkSpec, build_network, greedy_actions
 from baselines.runs import WEIGHTS_FILE, parse_json, read_bytes, write_atomically
 from mapp_env import Grid
 
@@ -28,9 +28,9 @@ MAX_TABLE_CELLS = 4096  # the most cells for which a Grid keeps the distances of
 
 
 class NetworkPolicy:
-    """Greedy commands of a network: every agent takes the action with its highest score."""
+    """Greedy commands of a network: the joint action, or each agent's, of the highest value."""
 
-    def __init__(self, network: PaperNetwork) -> None:
+    def __init__(self, network: Network) -> None:
         self.network = network
         self.spec = network.spec
 
@@ -47,9 +47,7 @@ class NetworkPolicy:
         spec = self.spec
         checked = check_observations(observations, spec.n_agents, spec.n_landmarks, spec.n_cells)
         with torch.inference_mode():
-            scores = self.network(torch.from_numpy(checked))
-            actions: np.ndarray = scores.argmax(dim=-1).numpy()
-        return actions
+            return greedy_actions(self.network(torch.from_numpy(checked)), spec)
 
 
 class RandomPolicy:
@@ -106,7 +104,7 @@ class NearestLandmarkPolicy:
         return actions
 
 
-def save_policy(path: Path, network: PaperNetwork) -> None:
+def save_policy(path: Path, network: Network) -> None:
     """Write a network's weights and its spec to a safetensors file, in one piece."""
     # One metadata entry only: safetensors writes several in no fixed order.
     about = json.dumps({"version": WEIGHTS_VERSION, **network.spec.as_dict()}, sort_keys=True)

@@ -8,13 +8,13 @@ from baselines.checks import check_count
 
 
 class Batch(NamedTuple):
-    """Transitions drawn from the memory; B rows, D numbers an observation, N agents."""
+    """Transitions; B states, T joint actions tried in each, D numbers an observation, N agents."""
 
     observations: np.ndarray  # (B, D) float32
-    actions: np.ndarray  # (B, N) int64, one action per agent
-    rewards: np.ndarray  # (B,) float32, the team reward
-    next_observations: np.ndarray  # (B, D) float32, what was seen before any reset
-    terminated: np.ndarray  # (B,) bool, True where no reward can follow; a time-out is not that
+    actions: np.ndarray  # (B, T, N) int64, one action per agent
+    rewards: np.ndarray  # (B, T) float32, the team reward
+    next_observations: np.ndarray  # (B, T, D) float32, what was seen before any reset
+    terminated: np.ndarray  # (B, T) bool, True where no reward can follow; a time-out is not that
 
 
 class ReplayMemory:
@@ -31,10 +31,10 @@ class ReplayMemory:
         self.capacity = capacity
         self.arrays = Batch(
             observations=np.zeros((capacity, observation_size), np.float32),
-            actions=np.zeros((capacity, n_agents), np.int64),
-            rewards=np.zeros(capacity, np.float32),
-            next_observations=np.zeros((capacity, observation_size), np.float32),
-            terminated=np.zeros(capacity, np.bool_),
+            actions=np.zeros((capacity, 1, n_agents), np.int64),
+            rewards=np.zeros((capacity, 1), np.float32),
+            next_observations=np.zeros((capacity, 1, observation_size), np.float32),
+            terminated=np.zeros((capacity, 1), np.bool_),
         )
         self.n_added = 0  # ever; the next transition goes to row n_added % capacity
 
@@ -71,3 +71,14 @@ class ReplayMemory:
             raise ValueError("sample: the replay memory is empty, add a transition first")
         rows = rng.integers(len(self), size=batch_size)
         return Batch(*(array[rows] for array in self.arrays))
+
+    def arrays_by_name(self) -> dict[str, np.ndarray]:
+        """Return all that is stored, for a checkpoint."""
+        filled = {name: array[: len(self)] for name, array in self.arrays._asdict().items()}
+        return {**filled, "n_added": np.array(self.n_added)}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take over what :meth:`arrays_by_name` returned."""
+        self.n_added = int(arrays["n_added"])
+        for name, array in self.arrays._asdict().items():
+            array[: len(self)] = arrays[name]
