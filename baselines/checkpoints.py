@@ -71,7 +71,7 @@ class Checkpoints:
         """
         self.folder.mkdir(exist_ok=True)
         content = safetensors.numpy.save(
-            {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+            {name: np.asarray(array, order="C") for name, array in arrays.items()}
         )
         record = {
             "format": FORMAT,

@@ -304,13 +304,21 @@ class MetaLearner:
 
     # -- checkpoints
 
+    @property
+    def replay(self) -> ReplayMemory | ImaginedReplay:
+        """What is learned from."""
+        if self.memory is not None:
+            return self.memory
+        assert self.imagined is not None
+        return self.imagined
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""
         parts: dict[str, dict[str, np.ndarray]] = {
             "network": {name: t.numpy() for name, t in self.network.state_dict().items()},
             "target": {name: t.numpy() for name, t in self.target.state_dict().items()},
             "optimiser": optimiser_arrays(self.optimiser),
-            "replay": (self.memory or self.imagined).arrays_by_name(),  # type: ignore[union-attr]
+            "replay": self.replay.arrays_by_name(),
         }
         if self.prepared is not None:
             batch, targets = self.prepared
@@ -335,7 +343,7 @@ class MetaLearner:
         for name, network in (("network", self.network), ("target", self.target)):
             network.load_state_dict({k: torch.from_numpy(v) for k, v in part(name).items()})
         restore_optimiser(self.optimiser, part("optimiser"))
-        (self.memory or self.imagined).restore(part("replay"))  # type: ignore[union-attr]
+        self.replay.restore(part("replay"))
         prepared = part("prepared")
         if prepared:
             targets = torch.from_numpy(prepared.pop("targets"))

@@ -340,7 +340,7 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self._start = self._last = time.perf_counter()
+        self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
         """Book the time since the last lap under `name`."""
@@ -350,8 +350,8 @@ class Stopwatch:
 
     @property
     def total(self) -> float:
-        """Seconds from the start to the last lap."""
-        return self._last - self._start
+        """Seconds of all laps, those before a resumption included."""
+        return sum(self.seconds.values())
 
     def __str__(self) -> str:
         total = max(self.total, 1e-9)

@@ -18,6 +18,8 @@ def content(number: int) -> tuple[dict[str, np.ndarray], dict[str, object]]:
         "memory.terminated": rng.random(7) < 0.5,
         "torch": rng.integers(256, size=16, dtype=np.uint8),
         "empty": np.zeros((0, 3), np.float64),
+        "scalar": np.array(number),
+        "transposed": rng.normal(size=(3, 2)).T,
     }
     return arrays, {"steps": number, "rng": rng.bit_generator.state, "loss": 0.1 + number}
 
@@ -40,6 +42,7 @@ def test_what_was_saved_is_loaded(tmp_path):
     assert loaded.arrays.keys() == arrays.keys()
     for name, array in arrays.items():
         assert loaded.arrays[name].dtype == array.dtype
+        assert loaded.arrays[name].shape == array.shape
         np.testing.assert_array_equal(loaded.arrays[name], array)
 
 
