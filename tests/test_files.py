@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import time
@@ -273,6 +274,22 @@ def test_flipped_bytes_never_crash(tmp_path: Path) -> None:
         else:
             plan.verify()
     assert refused > 1000
+
+
+def test_a_file_that_cannot_be_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If a regular file opens but reading fails, the message still names it."""
+    path = tmp_path / "problem.json"
+    PROBLEM.save(path)
+
+    class Broken(io.BytesIO):
+        def read(self, *_: object) -> bytes:
+            raise OSError("bad disk")
+
+    monkeypatch.setattr(os, "fdopen", lambda *_, **__: Broken())
+    with pytest.raises(FileError, match=r"problem\.json: cannot be read: bad disk"):
+        Problem.load(path)
 
 
 def test_a_tampered_plan_is_refused(tmp_path: Path) -> None:
