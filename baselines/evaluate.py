@@ -23,6 +23,7 @@ import tyro
 from baselines.checks import check_count, check_number
 from baselines.evaluation import (
     EVALUATION_SEED,
+    MAX_EXACT_LANDMARKS,
     Evaluation,
     count_problems,
     count_unseen,
@@ -125,6 +126,11 @@ def choose_problems(args: Args, setting: Setting, seen: list[tuple[int, ...]]) -
                 "run was trained on among them\n"
             )
         return every_problem(setting)
+    if count_problems(setting) == 0:
+        raise ValueError(
+            f"n_landmarks must be at most {setting.grid.reachable.size}, the cells of this grid "
+            f"that may hold one; got {setting.n_landmarks}"
+        )
     n_problems = count_unseen(setting, seen)
     if n_problems < 1:
         raise ValueError("problems: there is none that the run was not trained on")
@@ -134,8 +140,10 @@ def choose_problems(args: Args, setting: Setting, seen: list[tuple[int, ...]]) -
 
 
 def worst_cases(evaluation: Evaluation) -> list[str]:
-    """Return lines that name the first unsolved problem and the first of the largest gap."""
+    """Return lines on the first unsolved problem and the first of the largest gap, if any."""
     lines = []
+    if evaluation.optima is None:
+        lines.append(f"no gaps: optima are proven up to {MAX_EXACT_LANDMARKS} landmarks")
     unsolved = ~evaluation.success
     if unsolved.any():
         cells = " ".join(map(str, evaluation.landmarks[unsolved.argmax()]))

@@ -31,6 +31,7 @@ REWARDS = ("manhattan", "geodesic", "step")
 N_ACTIONS = 4
 MAX_STATES = 2**26  # half a gigabyte of values
 SAME = 1e-9  # values closer than this are a tie
+LEAST_WEIGHT = 10 * SAME  # of the last step of an episode, seen from the first
 WORST = -1e9  # below any discounted sum of rewards
 
 
@@ -190,7 +191,8 @@ class Args:
     rewards: tuple[str, ...] = REWARDS
     """which rewards (rule R6)"""
     discount: float = 0.95
-    """discount factor of future rewards; the paper's is 0.95"""
+    """discount factor of future rewards; the paper's is 0.95. One too small for the step limit is
+    refused, as values could not tell late steps apart"""
     problems: int = 100
     """number of random problems: one takes about a second for each reward"""
     seed: int = EVALUATION_SEED
@@ -213,6 +215,12 @@ class Args:
         check_count("n_agents", self.n_agents, 1, 16)
         check_count("n_landmarks", self.n_landmarks, 1, 256)
         check_count("max_cycles", self.max_cycles, 1, 1_000_000)
+        # The last step counts so much at the start; if it is lost in the values, all is a tie.
+        if self.discount**self.max_cycles < LEAST_WEIGHT:
+            raise ValueError(
+                f"discount ** max_cycles must be at least {LEAST_WEIGHT:g}, so that late steps "
+                f"still count; got {self.discount:g} ** {self.max_cycles}"
+            )
 
 
 def study(

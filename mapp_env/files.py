@@ -234,6 +234,8 @@ def read_bytes(
         with os.fdopen(handle, "rb", closefd=False) as file:
             # Again: the file may have grown since.
             data = file.read(limit + 1)
+    except OSError as error:
+        raise error_type(f"{source}: cannot be read: {error}") from error
     finally:
         os.close(handle)
     if len(data) > limit:

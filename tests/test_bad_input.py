@@ -55,27 +55,27 @@ def refusal(name: str, value: Any, call: Callable[[], Any]) -> str:
 @pytest.mark.parametrize("face", FACES)
 def test_counts(face: str, name: str, value: Any) -> None:
     """Counts that are zero, negative, fractional, bool, absurd or no number are refused at once."""
-    began = time.perf_counter()
+    began = time.process_time()
     message = refusal(name, value, lambda: FACES[face](**{name: value}))
-    assert time.perf_counter() - began < 0.5
+    assert time.process_time() - began < 0.5
     assert re.search(r"\b1\b", message), "the message names the smallest allowed value"
 
 
 @pytest.mark.parametrize("value", BAD_COUNTS, ids=repr)
 def test_num_envs(value: Any) -> None:
     """make_vec refuses a number of rows that is not one, or absurd, before it allocates."""
-    began = time.perf_counter()
+    began = time.process_time()
     refusal("num_envs", value, lambda: mapp_env.make_vec(value))
-    assert time.perf_counter() - began < 0.05
+    assert time.process_time() - began < 0.05
 
 
 @pytest.mark.parametrize("name", ["n_agents", "n_landmarks", "max_cycles"])
 def test_absurd_counts_cost_nothing(name: str) -> None:
     """A count of a billion is refused within 50 ms: nothing of that size is ever made."""
     mapp_v0.parallel_env()
-    began = time.perf_counter()
+    began = time.process_time()
     refusal(name, 10**9, lambda: mapp_v0.parallel_env(**{name: 10**9}))
-    assert time.perf_counter() - began < 0.05
+    assert time.process_time() - began < 0.05
 
 
 @pytest.mark.parametrize(
@@ -616,10 +616,10 @@ def test_malformed_maps(case: str, tmp_path: Path) -> None:
         (lambda: mapp_v0.parallel_env(grid=str(path)), "bad one.map"),
     ]
     for call, wanted in calls:
-        began = time.perf_counter()
+        began = time.process_time()
         with pytest.raises(ValueError) as caught:  # noqa: PT011
             call()
-        assert time.perf_counter() - began < 1.0
+        assert time.process_time() - began < 1.0
         assert wanted in str(caught.value)
         if case in ("ragged", "unknown letter", "two depots", "inner blank line"):
             assert re.search(rf":{hint}:|\bline {hint}\b", str(caught.value))
@@ -650,14 +650,14 @@ from mapp_env import mapp_v0
 results = {}
 for path in sys.argv[1:]:
     for call in (mapp_env.Grid.load, lambda p: mapp_v0.parallel_env(grid=p)):
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             call(path)
             kind, message = "nothing", ""
         except Exception as error:
             kind = "ValueError" if isinstance(error, ValueError) else repr(error)
             message = str(error)
-        spent = time.perf_counter() - began
+        spent = time.process_time() - began
         results.setdefault(path, []).append([kind, message, spent])
 print(json.dumps(results))
 """

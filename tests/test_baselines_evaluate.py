@@ -175,6 +175,43 @@ def test_optima_are_those_of_solve(n_landmarks):
         assert getattr(optima, objective).tolist() == costs
 
 
+def test_optima_are_those_of_the_team():
+    """One agent, two and sixteen have each their own optimum."""
+    problems = unseen_problems(PAPER, 30)
+    means = []
+    for n_agents in (1, 2, 16):
+        setting = dataclasses.replace(PAPER, n_agents=n_agents)
+        optima = find_optima(setting, problems)
+        rows = problems.tolist()
+        costs = [solve(Problem(PAPER.grid, row, n_agents)).cost for row in rows]
+        assert optima.cover_time.tolist() == costs
+        means.append(optima.cover_time.mean())
+    assert means == sorted(set(means), reverse=True)
+
+
+def test_optimal_share_counts_among_all_problems():
+    """Whoever solves a few problems, these at their best, is not optimal on all."""
+    problems = unseen_problems(PAPER, 200)
+    optima = find_optima(PAPER, problems)
+    limit = int(np.median(optima.cover_time))
+    setting = dataclasses.replace(PAPER, max_cycles=limit)
+
+    result = evaluate(Walking(setting, problems, set()), setting, problems, optima)
+    share = 100 * (optima.cover_time <= limit).mean()
+    assert 50 <= share < 100
+    summary = result.summary()
+    assert summary["solved %"] == summary["optimal %"] == pytest.approx(share)
+    assert summary["gap %"] == summary["worst gap %"] == 0.0
+
+
+def test_no_problem_and_no_optimum_are_said(capsys):
+    """More landmarks than cells are named as such; without optima a line says why."""
+    with pytest.raises(ValueError, match=r"n_landmarks must be at most 40, .* got 41"):
+        script.main(script.Args("nearest", 5, n_landmarks=41))
+    script.main(script.Args("nearest", 2, n_landmarks=21))
+    assert "no gaps: optima are proven up to 20 landmarks" in capsys.readouterr().out
+
+
 def test_no_optima_no_gaps():
     """Beyond the exact solver's reach gaps are dashes, and there is no row of the optimum."""
     setting = Setting(Grid(np.zeros((6, 6), np.bool_)), 2, 21, 3)

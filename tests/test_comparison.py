@@ -96,6 +96,16 @@ def test_nothing_overlaps_and_nothing_is_cut_off(n_plans: int, rows: int) -> Non
             assert min(across, down) <= 1  # pixel
 
 
+def test_panels_are_read_like_lines() -> None:
+    """From left to right, three in a row, then the next row below."""
+    figure = compare_plans(PROBLEM, {str(index): OPTIMUM for index in range(5)})
+    corners = [ax.get_position().corners()[0] for ax in figure.axes]
+    places = [(round(-bottom, 6), round(left, 6)) for left, bottom in corners]
+    assert places == sorted(places)
+    assert len({down for down, _ in places}) == 2
+    assert len({across for _, across in places}) == 3
+
+
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf", ".PNG"])
 def test_it_is_written(tmp_path: Path, suffix: str) -> None:
     """With a path the figure is in a file of the format that the path names."""
@@ -121,6 +131,7 @@ def test_a_label_that_is_a_number_is_refused() -> None:
 
 
 OTHER = mapp_env.Problem(GRID, (0, 6, 20, 42, 41), 3)
+ELSEWHERE = mapp_env.Problem(mapp_env.Grid(np.zeros((7, 7), bool)), PROBLEM.landmarks, 3)
 
 
 @pytest.mark.parametrize(
@@ -132,6 +143,7 @@ OTHER = mapp_env.Problem(GRID, (0, 6, 20, 42, 41), 3)
         (PROBLEM, {str(index): OPTIMUM for index in range(13)}, "plans must be a mapping of 1"),
         (PROBLEM, {"a": None}, r"plans\['a'\] must be a mapp_env.Plan"),
         (PROBLEM, {"a": mapp_env.solve(OTHER)}, r"plans\['a'\] is a plan of another problem"),
+        (PROBLEM, {"a": mapp_env.solve(ELSEWHERE)}, r"plans\['a'\] is a plan of another problem"),
         (replace(PROBLEM, n_agents=2), {"a": OPTIMUM}, "another problem"),
         (PROBLEM, {"a": replace(OPTIMUM, cover_time=3), "b": OPTIMUM}, "below 12"),
     ],

@@ -86,9 +86,9 @@ def test_extreme_options(name: str, options: dict[str, float]) -> None:
 def test_largest_grids_are_quick(name: str) -> None:
     """512 x 512 takes well under a few seconds, and is connected."""
     make_grid(name)
-    start = time.perf_counter()
+    start = time.process_time()
     grid = make_grid(name, rows=512, cols=512, seed=1)
-    assert time.perf_counter() - start < 3
+    assert time.process_time() - start < 3
     assert grid.walls.shape == (512, 512)
     assert grid.reachable.size + 1 == int((~grid.walls).sum())
 

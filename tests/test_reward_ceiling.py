@@ -8,7 +8,9 @@ import pytest
 from baselines import reward_ceiling
 from baselines.evaluation import Setting, find_optima, unseen_problems
 from baselines.reward_ceiling import (
+    CoverTimes,
     RewardModel,
+    Solved,
     cover_times,
     iterate_values,
     left_after,
@@ -101,6 +103,40 @@ def test_counting_steps_has_no_ceiling():
             np.testing.assert_allclose(times, optimum)
 
 
+@pytest.mark.parametrize("reward", REWARDS)
+def test_rewards_are_those_of_the_environment(reward):
+    """Among walls that no distance may ignore, every step of a walk earns what the model says."""
+    setting = Setting(make_grid(), 3, 5, 50)
+    landmarks = (0, 6, 20, 42, 48)
+    model = RewardModel(setting, landmarks, reward)
+    actions = np.random.default_rng(1).integers(0, 4, (50, 3)).tolist()
+    rewards, _ = play(setting, landmarks, actions, reward)
+    places, unvisited = (model.depot,) * 3, 31
+    for joint_action, earned in zip(actions, rewards, strict=True):
+        moves = zip(places, joint_action, strict=True)
+        places = tuple(int(model.moves[place, action]) for place, action in moves)
+        assert model.rewards(unvisited, reward)[places] == earned
+        unvisited = left_after(model, places, unvisited)
+    assert unvisited < 31
+
+
+def test_ties_of_different_ends_are_averaged():
+    """To the near landmark first 4 steps, to the far one first 5: each with an even chance."""
+    model = RewardModel(Setting(Grid.from_text(".D.."), 1, 2, 50), (0, 3), "step")
+    nowhere, near, far, both = [0, 0, 0, 0], [3, 2, 1, 0], [0, 1, 2, 3], [1, 0, 1, 2]
+    solved = Solved(model, [np.array(line, float) for line in (nowhere, near, far, both)])
+    assert cover_times(solved, 5) == CoverTimes(4.5, 4, 5)
+    assert cover_times(solved, 4) == CoverTimes(np.inf, 4, np.inf)
+
+
+def test_row_of_the_table_says_how_ties_break():
+    """Solved, optimal and largest are for the worst ties; gaps are means of the solved problems."""
+    found = [CoverTimes(4.5, 4, 5), CoverTimes(4, 4, 4), CoverTimes(np.inf, 9, np.inf)]
+    row = reward_ceiling.format_row("any", found, np.array([4, 4, 8]))
+    cells = [cell.strip() for cell in row.split("|")[1:-1]]
+    assert cells == ["any", "66.67", "6.25", "0.00 - 12.50", "33.3", "25.0"]
+
+
 def test_ties_are_followed_to_their_end():
     """Without foresight every move is a tie: at best 7 steps, at worst the limit is not enough."""
     setting = Setting(Grid.from_text("...D.."), 1, 2, 50)
@@ -117,6 +153,18 @@ def test_too_many_states_are_refused():
         reward_ceiling.main(reward_ceiling.Args(n_agents=6, n_landmarks=5))
     with pytest.raises(ValueError, match="rewards must be"):
         reward_ceiling.Args(rewards=("distance",))
+
+
+def test_discounts_that_lose_late_steps_are_refused():
+    """Where a step more or less vanishes in the values, ties would be false: nobody is told so."""
+    setting = Setting(Grid(np.zeros((1, 15), np.bool_), depot=0), 1, 1, 50)
+    (times,) = study(setting, [(14,)], "step", 0.1)
+    assert times.worst > 14  # a gap, though there is none
+    for discount, limit in ((0.1, 50), (0.0, 1), (0.95, 500)):
+        with pytest.raises(ValueError, match=r"discount \*\* max_cycles must be at least 1e-08"):
+            reward_ceiling.Args(discount=discount, max_cycles=limit)
+    reward_ceiling.Args(discount=0.95, max_cycles=300)
+    reward_ceiling.Args(discount=1.0, max_cycles=1_000_000)
 
 
 def test_table_has_a_row_for_each_reward(capsys):

@@ -178,7 +178,7 @@ def test_search_keeps_to_its_time() -> None:
     found = solve_search(problem, "cover_time", time_limit=0.3)
     seconds = time.perf_counter() - start
     assert not found.optimal
-    assert 0.3 <= seconds < 1.5
+    assert 0.3 <= seconds < 4
 
 
 @pytest.mark.parametrize("kind", ["random", "maze"])
@@ -325,7 +325,7 @@ def test_pyvrp_takes_all_sizes(n_landmarks: int, n_agents: int) -> None:
     for objective in OBJECTIVES:
         start = time.perf_counter()
         plan = solve(problem, objective, method="pyvrp", time_limit=0.2)
-        assert time.perf_counter() - start < 2
+        assert time.perf_counter() - start < 5
         plan.verify(problem)
 
 
