@@ -373,8 +373,13 @@ def joint_values(values: Tensor, spec: NetworkSpec) -> Tensor:
     return whole
 
 
+def main(args: Args) -> int:
+    """Train, evaluate, draw; return the exit code."""
+    return run_experiment(args, ALGORITHM, MetaLearner)
+
+
 if __name__ == "__main__":
     try:
-        sys.exit(run_experiment(parse_options(Args, __doc__ or ""), ALGORITHM, MetaLearner))
+        sys.exit(main(parse_options(Args, __doc__ or "")))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error

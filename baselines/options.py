@@ -70,7 +70,7 @@ class Options:
     """error at which the loss turns from a square into a line"""
     double: bool = False
     """whether the network picks the next action that the target network values"""
-    batch_size: int = 256
+    batch_size: int = 512
     """states in an update"""
     learning_starts: int = 500
     """steps played before the first update"""
@@ -85,7 +85,7 @@ class Options:
 
     final_reward: Literal["manhattan", "geodesic", "step", "same"] = "step"
     """reward that imagined transitions are given towards the end, or the same as before"""
-    final_from: float = 0.5
+    final_from: float = 0.2
     """part of the episodes after which that is so"""
     final_discount: float = 0.98
     """discount factor from then on"""
@@ -97,7 +97,7 @@ class Options:
     agents and relabelled with fresh landmarks (baselines/imagined_replay.py)"""
     memory_size: int = 10_000
     """transitions in the replay memory, if stored; the oldest is forgotten first"""
-    tried_actions: int = 4
+    tried_actions: int = 2
     """joint actions tried in each imagined state: the best, then others the better the likelier"""
     temperature: float = 0.3
     """difference of value at which another action is tried e times less"""
