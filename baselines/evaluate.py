@@ -35,7 +35,12 @@ from baselines.evaluation import (
     unseen_problems,
 )
 from baselines.guidance import Acting, Guidance, GuidedPolicy
-from baselines.policy import NearestLandmarkPolicy, RandomPolicy, load_policy
+from baselines.policy import (
+    NearestLandmarkPolicy,
+    RandomPolicy,
+    find_weights,
+    load_policy,
+)
 from baselines.settings import N_ACTIONS, Setting, check_fits, find_grid, read_setting
 
 
@@ -44,8 +49,8 @@ class Args:
     """Options of an evaluation."""
 
     policy: str
-    """a run folder or a weights file; or "random", or "nearest" (each agent walks a shortest path
-    to its nearest unvisited landmark)"""
+    """a pretrained policy's name, a run folder or a weights file; or "random", or "nearest" (each
+    agent walks a shortest path to its nearest unvisited landmark)"""
     problems: int | Literal["universe"] = 1000
     """number of distinct problems, none of them a training problem of the run; or "universe": all
     problems of the grid, training problems too"""
@@ -96,8 +101,7 @@ def main(args: Args) -> None:
             policy = NearestLandmarkPolicy(setting.grid, setting.n_agents, setting.n_landmarks)
     else:
         policy = trained = load_policy(args.policy)
-        folder = Path(args.policy)
-        folder = folder if folder.is_dir() else folder.parent
+        folder = find_weights(args.policy).parent
         setting, seen = read_setting(folder)
         check_fits(trained.spec, setting, folder)
     label = args.policy

@@ -24,6 +24,7 @@ WEIGHTS_VERSION = 1
 # The largest network that NetworkSpec allows takes 74 MiB.
 MAX_WEIGHTS_BYTES = 80 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024
+PRETRAINED = Path(__file__).parent / "pretrained"  # a folder for each name, like a run's
 MAX_TABLE_CELLS = 4096  # the most cells for which a Grid keeps the distances of all pairs
 
 
@@ -118,7 +119,7 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
     Parameters
     ----------
     path
-        A run folder, or a weights file.
+        The name of a pretrained policy, a run folder, or a weights file.
 
     Returns
     -------
@@ -161,22 +162,33 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
     return NetworkPolicy(network.eval())
 
 
+def pretrained_names() -> list[str]:
+    """Return the names of the policies that come with the baselines."""
+    if not PRETRAINED.is_dir():
+        return []
+    return sorted(path.name for path in PRETRAINED.iterdir() if (path / WEIGHTS_FILE).is_file())
+
+
 def find_weights(path: object) -> Path:
-    """Return the weights file that is meant by a run folder or by the file itself.
+    """Return the weights file that is meant by a pretrained policy's name, a run folder or itself.
 
     Raises
     ------
     ValueError
         If there is none.
     """
+    names = pretrained_names()
     try:
-        place = Path(path)  # type: ignore[arg-type]
+        place = PRETRAINED / path if path in names else Path(path)  # type: ignore
         file = place / WEIGHTS_FILE if place.is_dir() else place
         found = file.exists()
     except (TypeError, OSError):  # no path at all, or one that the system does not take
         found = False
     if not found:
-        raise ValueError(f"path must be a run folder or a weights file, got {reprlib.repr(path)}")
+        raise ValueError(
+            f"path must be a run folder or a weights file{', or one of ' if names else ''}"
+            f"{', '.join(names)}, got {reprlib.repr(path)}"
+        )
     return file
 
 

@@ -1,0 +1,136 @@
+"""Let a trained policy solve one problem, beside the proven optimum.
+
+Command::
+
+    python baselines/solve.py --policy pretrained --landmarks 0 6 20 42 48 --picture routes.png
+
+Output: the routes, their costs and the gap to the optimum; with ``--picture`` a figure of the
+policy's routes and the optimal ones, with ``--plan`` the policy's plan as a JSON file that
+``mapp_env.Plan.load`` reads. Exit code 1 if the policy does not solve the problem.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from baselines.evaluation import evaluate
+from baselines.policy import NetworkPolicy, find_weights, load_policy
+from baselines.settings import Setting, check_fits, read_setting
+from mapp_env import Plan, Problem, replay, solve
+
+
+@dataclass
+class Args:
+    """Options of solving one problem."""
+
+    landmarks: tuple[int, ...]
+    """the landmarks' cells: row * columns + column"""
+    policy: str = "pretrained"
+    """a pretrained policy's name, a run folder or a weights file"""
+    picture: Path | None = None
+    """where to draw the routes beside the optimum: a .png, .svg or .pdf file"""
+    plan: Path | None = None
+    """where to write the policy's plan: a JSON file"""
+
+
+def load(policy: str) -> tuple[NetworkPolicy, Setting]:
+    """Return a trained policy and what it was trained for.
+
+    Raises
+    ------
+    ValueError
+        If there is no such policy, or its folder does not say what it was trained for.
+    """
+    trained = load_policy(policy)
+    folder = find_weights(policy).parent
+    setting, _ = read_setting(folder)
+    check_fits(trained.spec, setting, folder)
+    return trained, setting
+
+
+def make_problem(setting: Setting, landmarks: tuple[int, ...]) -> Problem:
+    """Return the problem of some landmarks.
+
+    Raises
+    ------
+    ValueError
+        If there are not as many as the policy was trained for, or one cannot be.
+    """
+    if len(landmarks) != setting.n_landmarks:
+        raise ValueError(
+            f"landmarks must be {setting.n_landmarks} cells for this policy, got {len(landmarks)}"
+        )
+    return Problem(setting.grid, landmarks, setting.n_agents, setting.max_cycles)
+
+
+def solve_by_policy(policy: NetworkPolicy, setting: Setting, problem: Problem) -> Plan:
+    """Return what the rules make of a policy's greedy episode."""
+    played = evaluate(policy, setting, np.array([problem.landmarks]), n_kept=1)
+    return replay(problem, played.actions[: played.steps[0], 0])
+
+
+def describe(label: str, plan: Plan) -> str:
+    """Return a plan's costs in a line."""
+    if not plan.success:
+        visited = sum(len(claims) for claims in plan.claims)
+        return f"{label}: not solved, {visited} landmarks visited"
+    return (
+        f"{label}: cover time {plan.cover_time}, makespan {plan.makespan}, "
+        f"total distance {plan.total_distance}"
+    )
+
+
+def report(problem: Problem, plans: dict[str, Plan], optimum: Plan) -> None:
+    """Print plans beside the optimum, and the routes of the last one."""
+    for label, plan in plans.items():
+        line = describe(label, plan)
+        if plan.success and optimum.status == "optimal":
+            line += f"; gap {100 * (plan.cover_time / optimum.cost - 1):.1f} %"
+        print(line)
+    name = "optimum" if optimum.status == "optimal" else "best known"
+    print(describe(name, optimum))
+    for agent, tour in enumerate(list(plans.values())[-1].tours):
+        print(f"agent {agent}: {' '.join(map(str, tour)) or 'stays at the depot'}")
+
+
+def save(args: Args, problem: Problem, plans: dict[str, Plan], optimum: Plan) -> None:
+    """Write what was asked for, of the last plan and the optimum."""
+    if args.plan is not None:
+        list(plans.values())[-1].save(args.plan)
+        print(f"plan: {args.plan}")
+    if args.picture is not None:
+        # Only here: drawing takes longer to import than all the rest to run.
+        from mapp_env.rendering import compare_plans
+
+        name = "optimum" if optimum.status == "optimal" else "best known"
+        compare_plans(problem, {**plans, name: optimum}, args.picture)
+        print(f"picture: {args.picture}")
+
+
+def main(args: Args) -> int:
+    """Solve one problem; return the exit code."""
+    torch.set_num_threads(1)
+    policy, setting = load(args.policy)
+    problem = make_problem(setting, args.landmarks)
+    start = time.perf_counter()
+    plan = solve_by_policy(policy, setting, problem)
+    seconds = time.perf_counter() - start
+    optimum = solve(problem)
+    report(problem, {"policy": plan}, optimum)
+    print(
+        f"policy {1000 * seconds:.0f} ms, {optimum.solver} solver {1000 * optimum.seconds:.0f} ms"
+    )
+    save(args, problem, {"policy": plan}, optimum)
+    return 0 if plan.success else 1
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(tyro.cli(Args, description=__doc__)))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from error
