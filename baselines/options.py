@@ -74,7 +74,7 @@ class Options:
     """states in an update"""
     learning_starts: int = 500
     """steps played before the first update"""
-    updates_per_episode: int = 50
+    updates_per_episode: int = 40
     """updates after each episode"""
     update_interval: int = 0
     """steps played between two updates; 0 for none but those after episodes"""
