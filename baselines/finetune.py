@@ -72,6 +72,7 @@ def make_learner(
         dueling=spec.dueling,
         hidden_units=spec.hidden_units,
         code_units=spec.code_units,
+        landmark_units=spec.landmark_units,
         learning_rate=args.learning_rate,
         learning_rate_warmup=0,
         batch_size=256,

@@ -168,6 +168,12 @@ class ImaginedReplay:
         self.ages = np.where(stuck, self.max_length, self.ages + 1)
         return batch
 
+    def follow(self, actions: np.ndarray) -> None:
+        """Let the imagined episodes go on with joint actions (rows, N) whose moves are known."""
+        self.cells = self.moves[self.cells, actions]
+        self.visited = self.visited | is_on(self.cells, self.landmarks)
+        self.ages += 1
+
     def known_actions(self, observations: np.ndarray) -> np.ndarray | None:
         """Return which actions somebody has made from there, (B, N, A); None if it is all.
 

@@ -71,6 +71,7 @@ def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Network:
         outputs=args.outputs,
         dueling=args.dueling,
         code_units=args.code_units,
+        landmark_units=args.landmark_units,
     )
     return build_network(spec, generator)
 

@@ -34,6 +34,7 @@ class NetworkSpec:
     outputs: str = "agents"  # values of each agent's actions (N x A), or of joint actions (A ** N)
     dueling: bool = False  # a value and advantages (Wang et al. 2016) in place of values
     code_units: int = 64  # of "pairs": numbers that describe an agent among the landmarks
+    landmark_units: int = 0  # of "pairs": numbers that describe a landmark among the agents
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, tuple(NETWORKS))
@@ -45,6 +46,7 @@ class NetworkSpec:
         check_choice("outputs", self.outputs, OUTPUTS)
         check_flag("dueling", self.dueling)
         check_count("code_units", self.code_units, 1, 4096)
+        check_count("landmark_units", self.landmark_units, 0, 4096)
         if self.outputs == "joint" and self.n_joint_actions > MAX_JOINT_ACTIONS:
             raise ValueError(
                 f"outputs must be 'agents' for {self.n_agents} agents: 'joint' would have "
@@ -52,7 +54,8 @@ class NetworkSpec:
             )
         if self.kind == "pairs":
             check_count("n_agents", self.n_agents, 1, MAX_SORTED_AGENTS)
-            pairs = self.n_cells * (self.n_cells + 1) * self.code_units
+            units = self.code_units + self.n_agents * self.landmark_units
+            pairs = self.n_cells * (self.n_cells + 1) * units
             if pairs > MAX_WEIGHTS:
                 raise ValueError(
                     f"kind 'pairs' would have {pairs:,} weights on {self.n_cells:,} cells, allowed "
@@ -140,7 +143,8 @@ class PairsNetwork(nn.Module):
 
     An agent is described by the sum, over the unvisited landmarks, of a learned vector for the pair
     (its cell, the landmark's cell), and by one for its cell. The agents' descriptions, in the order
-    of their cells, and the set of unvisited landmarks go through a layer of rectifier units. Values
+    of their cells, and the set of unvisited landmarks go through a layer of rectifier units. With
+    ``landmark_units`` the landmarks are described among the agents as well, and summed. Values
     are given back in the agents' own order, so that, exactly:
 
     - to rename landmarks changes nothing, and where the visited ones stand does not matter;
@@ -149,6 +153,7 @@ class PairsNetwork(nn.Module):
 
     places: Tensor
     orders: Tensor
+    slots: Tensor
 
     def __init__(self, spec: NetworkSpec, generator: torch.Generator | None = None) -> None:
         super().__init__()
@@ -158,7 +163,13 @@ class PairsNetwork(nn.Module):
         self.pairs = bag(cells * (cells + 1), units, 0.3, generator)
         self.cell = bag(cells, units, 0.3, generator)
         self.unvisited = bag(cells + 1, spec.hidden_units, 0.1, generator)
-        self.hidden = linear(n * units, spec.hidden_units, generator)
+        self.crossed = None
+        n_codes = n * units
+        if spec.landmark_units:
+            self.crossed = bag(n * cells * (cells + 1), spec.landmark_units, 0.3, generator)
+            self.register_buffer("slots", torch.arange(n) * (cells * (cells + 1)), persistent=False)
+            n_codes += spec.landmark_units
+        self.hidden = linear(n_codes, spec.hidden_units, generator)
         self.head = Head(spec, generator)
         self.register_buffer("places", n ** torch.arange(n), persistent=False)
         self.register_buffer("orders", _joint_actions_by_order(spec), persistent=False)
@@ -172,6 +183,10 @@ class PairsNetwork(nn.Module):
         pairs = cells[:, :, None] * (self.spec.n_cells + 1) + landmarks[:, None, :]
         codes = self.pairs(pairs.view(-1, k)) + self.cell(cells.reshape(-1, 1))
         codes = torch.relu(codes).view(-1, n * self.spec.code_units)
+        if self.crossed is not None:
+            seen = (pairs + self.slots[:, None]).transpose(1, 2).reshape(-1, n)
+            crossed = torch.relu(self.crossed(seen)).view(-1, k, self.spec.landmark_units).sum(1)
+            codes = torch.cat((codes, crossed), 1)
         hidden = torch.relu(self.hidden(codes) + self.unvisited(landmarks))
         values = self.head(hidden)
         if self.spec.outputs == "joint":

@@ -55,6 +55,8 @@ class Options:
     """rectifier units in a hidden layer"""
     code_units: int = 64
     """numbers that describe an agent in the network "pairs\""""
+    landmark_units: int = 0
+    """numbers that describe a landmark in the network "pairs\""""
 
     learning_rate: float = 0.004
     """step size of Adam"""
@@ -165,6 +167,7 @@ COUNTS = (
     ("episodes_per_problem", 1, 1_000_000),
     ("hidden_units", 1, 4096),
     ("code_units", 1, 4096),
+    ("landmark_units", 0, 4096),
     ("learning_rate_warmup", 0, 1_000_000_000),
     ("batch_size", 1, 65_536),
     ("learning_starts", 1, 1_000_000_000),
