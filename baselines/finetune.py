@@ -9,9 +9,12 @@ Paper: section 5, last paragraph (arXiv 2110.01460).
 Command::
 
     python baselines/finetune.py --policy pretrained --landmarks 0 6 20 42 48
+    python baselines/finetune.py --policy pretrained --problems 100
 
 Output: the costs before and after beside the optimum, and the routes; ``--picture`` and ``--plan``
 as of solve.py. What counts is the best of the episodes that were played, the last one included.
+With ``--problems`` that many unseen problems which the policy does not solve optimally are
+fine-tuned, and it is said of how many the optimum was found.
 """
 
 import sys
@@ -21,15 +24,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import tyro
+from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
 from baselines.checks import check_count, check_number
+from baselines.evaluation import count_unseen, evaluate, find_optima, unseen_problems
 from baselines.experiment import Streams
 from baselines.meta_dqn import Args as TrainingArgs
 from baselines.meta_dqn import MetaLearner
 from baselines.options import preset_options
-from baselines.policy import NetworkPolicy
-from baselines.settings import N_ACTIONS, Setting
+from baselines.policy import NetworkPolicy, find_weights
+from baselines.settings import N_ACTIONS, Setting, read_setting
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 
 
@@ -37,6 +42,8 @@ from mapp_env import Plan, Problem, mapp_v0, replay, solve
 class Args(solving.Args):
     """Options of fine-tuning."""
 
+    problems: int = 0
+    """in place of landmarks: number of random problems to try, none of them solved optimally"""
     episodes: int = 30
     """most episodes to play"""
     random_episodes: int = 8
@@ -49,6 +56,7 @@ class Args(solving.Args):
     """seed of everything random"""
 
     def __post_init__(self) -> None:
+        check_count("problems", self.problems, 0, 1_000_000)
         check_count("episodes", self.episodes, 1, 30)
         check_count("random_episodes", self.random_episodes, 0, self.episodes - 1)
         check_count("updates_per_episode", self.updates_per_episode, 1, 10_000)
@@ -142,10 +150,37 @@ def play(
     return replay(replace(problem, max_cycles=None), np.array(taken))
 
 
+def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[int, ...]]) -> None:
+    """Fine-tune on unseen problems that the policy does not solve optimally, and count."""
+    landmarks = unseen_problems(
+        setting, min(100 * args.problems, count_unseen(setting, seen)), seen
+    )
+    result = evaluate(policy, setting, landmarks, find_optima(setting, landmarks))
+    chosen = landmarks[~(result.gaps <= 0.0)][: args.problems]
+    optimum = find_optima(setting, chosen)
+    assert optimum is not None
+    seconds, found, gaps = [], 0, []
+    for row, best in zip(tqdm(chosen.tolist(), disable=None), optimum.cover_time, strict=True):
+        start = time.perf_counter()
+        plan, _ = finetune(args, policy, setting, solving.make_problem(setting, tuple(row)))
+        seconds.append(time.perf_counter() - start)
+        found += plan.cover_time == best
+        gaps.append(plan.cover_time / best - 1)
+    print(
+        f"{len(chosen)} problems that the policy does not solve optimally: the optimum found on "
+        f"{found} ({100 * found / len(chosen):.1f} %), mean gap {100 * np.mean(gaps):.2f} %, "
+        f"{np.mean(seconds):.1f} s each on average, {max(seconds):.1f} s at most"
+    )
+
+
 def main(args: Args) -> int:
     """Fine-tune on one problem; return the exit code."""
     torch.set_num_threads(1)
     policy, setting = solving.load(args.policy)
+    if args.problems:
+        seen = read_setting(find_weights(args.policy).parent)[1]
+        study(args, policy, setting, seen)
+        return 0
     problem = solving.make_problem(setting, args.landmarks)
     before = solving.solve_by_policy(policy, setting, problem)
     start = time.perf_counter()

@@ -28,7 +28,7 @@ from mapp_env import Plan, Problem, replay, solve
 class Args:
     """Options of solving one problem."""
 
-    landmarks: tuple[int, ...]
+    landmarks: tuple[int, ...] = ()
     """the landmarks' cells: row * columns + column"""
     policy: str = "pretrained"
     """a pretrained policy's name, a run folder or a weights file"""

@@ -1,0 +1,112 @@
+"""Distillation: the solver's answers from any state, and a network that learns them."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from baselines import distill
+from baselines.evaluation import Setting, evaluate, find_optima, unseen_problems
+from baselines.exact_values import steps_left
+from baselines.policy import load_policy
+from mapp_env import Grid, make_grid, sample_problems
+from mapp_env.solvers import optimal_costs
+
+SMALL = {
+    "n_agents": 2,
+    "n_landmarks": 2,
+    "hidden_units": 32,
+    "code_units": 16,
+    "landmark_units": 8,
+    "batch_size": 64,
+    "evaluation_problems": 0,
+}
+
+
+def tables(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return moves and distances as the labels want them."""
+    return np.asarray(grid.moves)[:, :4].astype(np.int64), np.asarray(grid.distances, np.int64)
+
+
+@pytest.mark.parametrize(
+    ("grid", "n_agents", "n_landmarks"),
+    [
+        (make_grid(), 3, 5),
+        (make_grid(), 1, 4),
+        (make_grid("rooms", rows=9, cols=8, seed=2), 4, 3),
+        (make_grid("maze", rows=7, cols=9, seed=1), 2, 6),
+    ],
+)
+def test_labels_at_the_depot_are_the_optimum(grid, n_agents, n_landmarks):
+    """One step and the best that is left after it are the proven optimum of the problem."""
+    landmarks = sample_problems(grid, 200, n_landmarks).astype(np.int64)
+    cells = np.full((200, n_agents), grid.depot)
+    steps = steps_left(cells, landmarks, np.zeros(landmarks.shape, bool), *tables(grid))
+    optimum = optimal_costs(grid, landmarks, n_agents)
+    np.testing.assert_array_equal(steps.min(axis=1) + 1, optimum)
+
+
+@pytest.mark.parametrize(("n_agents", "n_landmarks"), [(1, 3), (2, 3), (3, 4)])
+def test_labels_are_consistent_along_any_walk(n_agents, n_landmarks):
+    """What is left after an action is one step more than what is left after the best next one."""
+    grid = make_grid("random", rows=6, cols=7, seed=4, density=0.25)
+    moves, distances = tables(grid)
+    rng = np.random.default_rng(n_agents)
+    anywhere = np.append(grid.reachable, grid.depot)
+    cells = rng.choice(anywhere, (40, n_agents))
+    landmarks = sample_problems(grid, 40, n_landmarks).astype(np.int64)
+    visited = (landmarks[:, :, None] == cells[:, None]).any(2) | (rng.random(landmarks.shape) < 0.3)
+    steps = steps_left(cells, landmarks, visited, moves, distances)
+    for joint in range(4**n_agents):
+        actions = np.array(np.unravel_index(joint, (4,) * n_agents))
+        following = moves[cells, actions]
+        seen = visited | (landmarks[:, :, None] == following[:, None]).any(2)
+        left = steps_left(following, landmarks, seen, moves, distances).min(axis=1) + 1
+        np.testing.assert_array_equal(steps[:, joint], np.where(seen.all(axis=1), 0, left))
+
+
+def test_loss_is_the_probability_of_acting_optimally():
+    """Minus its logarithm, by hand: two of four actions are optimal."""
+    scores = torch.log(torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
+    loss = distill.optimal_actions_loss(scores, np.array([[5, 4, 6, 4]]))
+    assert float(loss) == pytest.approx(-np.log(0.6))
+
+
+def test_pupil_learns_the_optimum(tmp_path):
+    """On a small grid a few hundred updates solve every problem, nearly all of them optimally."""
+    (tmp_path / "grid.txt").write_text("....\n.#D.\n..#.\n....")
+    args = distill.Args(
+        grid=str(tmp_path / "grid.txt"), updates=400, out=tmp_path / "run", max_cycles=20, **SMALL
+    )
+    assert distill.main(args) == 0
+    setting = Setting(Grid.load(tmp_path / "grid.txt"), 2, 2, 20)
+    problems = unseen_problems(setting, 78)
+    result = evaluate(
+        load_policy(tmp_path / "run"), setting, problems, find_optima(setting, problems)
+    )
+    assert result.summary()["solved %"] == 100.0
+    assert result.summary()["optimal %"] > 95.0
+
+
+def test_stopped_and_resumed_is_the_same(tmp_path, monkeypatch):
+    """Stopped by SIGTERM and resumed: the same bytes of metrics and weights."""
+    options = {**SMALL, "updates": 250, "checkpoint_seconds": 1e9}
+    assert distill.main(distill.Args(out=tmp_path / "whole", **options)) == 0
+    update, calls = distill.Pupil.update, []
+
+    def interrupted(self):
+        calls.append(None)
+        if len(calls) == 137:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return update(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(distill.Pupil, "update", interrupted)
+        assert distill.main(distill.Args(out=tmp_path / "run", **options)) == 143
+    assert distill.main(distill.Args(resume=tmp_path / "run")) == 0
+    for name in ("metrics.csv", "policy.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    with pytest.raises(ValueError, match="leave out all others"):
+        distill.main(distill.Args(resume=tmp_path / "run", seed=1))
