@@ -48,9 +48,9 @@ class Args(solving.Args):
     """most episodes to play"""
     random_episodes: int = 8
     """how many of them walk at random"""
-    updates_per_episode: int = 10
+    updates_per_episode: int = 15
     """updates after each of the others"""
-    learning_rate: float = 0.001
+    learning_rate: float = 0.002
     """step size of Adam; it falls in a straight line to 0"""
     seed: int = 0
     """seed of everything random"""
@@ -84,6 +84,9 @@ def make_learner(
         learning_rate=args.learning_rate,
         learning_rate_warmup=0,
         batch_size=256,
+        # One problem has few states, so more of what could be done is tried.
+        tried_actions=4,
+        imagined_exploration=0.3,
         final_from=0.0,
         prefetch=False,
     )
