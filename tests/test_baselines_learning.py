@@ -122,6 +122,92 @@ def test_team_reward_teaches_each_agent_its_own_action(seed):
     assert greedy == [[LEFT, DOWN], [RIGHT, UP]]
 
 
+def fill(learner: MetaLearner) -> None:
+    """Tell a learner of some moves that are chance."""
+    rng = np.random.default_rng(0)
+    size = learner.spec.observation_size
+    for _ in range(40):
+        observation, following = rng.integers(0, 2, (2, size)).astype(np.float32)
+        actions = rng.integers(4, size=learner.spec.n_agents)
+        learner.remember(observation, actions, -1.0, following, False)
+
+
+def test_step_size_rises_and_falls():
+    """It rises over the warm-up in equal parts, and falls in a straight line to nothing."""
+
+    def rates(**changes):
+        learner = paper_learner(0, 1, batch_size=4, learning_rate=0.01, **changes)
+        fill(learner)
+        seen = []
+        for update in range(5):
+            learner.update(update / 5)
+            seen += [group["lr"] for group in learner.optimiser.param_groups]
+        return pytest.approx(seen)
+
+    assert rates() == [0.01] * 5
+    assert rates(learning_rate_falls=True) == [0.01, 0.008, 0.006, 0.004, 0.002]
+    assert rates(learning_rate_warmup=4) == [0.0025, 0.005, 0.0075, 0.01, 0.01]
+    both = {"learning_rate_warmup": 4, "learning_rate_falls": True}
+    assert rates(**both) == [0.0025, 0.004, 0.0045, 0.004, 0.002]
+
+
+def test_target_network_is_copied_or_follows():
+    """It is a copy every so many updates, or moves by its rate towards the network at each."""
+    learner = paper_learner(0, 1, batch_size=4, target_interval=3)
+    fill(learner)
+    for update in range(1, 8):
+        before = [tensor.clone() for tensor in learner.target_weights]
+        learner.update(0.0)
+        expected = learner.weights if update % 3 == 0 else before
+        assert all(map(torch.equal, learner.target_weights, expected))
+        assert not torch.equal(before[0], learner.weights[0])
+    learner = paper_learner(0, 1, batch_size=4, target_interval=0, target_rate=0.2)
+    fill(learner)
+    for _ in range(3):
+        before = [tensor.clone() for tensor in learner.target_weights]
+        learner.update(0.0)
+        for old, new, own in zip(before, learner.target_weights, learner.weights, strict=True):
+            torch.testing.assert_close(new, 0.8 * old + 0.2 * own.detach())
+
+
+def test_imagined_goal_changes_when_it_is_said_to():
+    """Up to a part of the training it is the env's reward, from then on the final one."""
+    args = Args(
+        n_agents=1,
+        n_landmarks=1,
+        hidden_units=8,
+        code_units=4,
+        batch_size=64,
+        tried_actions=4,
+        imagined_length=2,
+        discount=0.5,
+        final_discount=0.75,
+        final_from=0.4,
+    )
+    grid = Grid.from_text("D....")
+    learner = MetaLearner(args, grid, Streams.spawn(0))
+    for cell in range(5):
+        for action in range(4):
+            here, there = ([at, 0, 0] for at in (cell, grid.moves[cell, action]))
+            learner.remember(
+                np.array(here, np.float32), np.array([action]), 0.0, np.array(there), False
+            )
+    for progress, scale, discount in ((0.0, 0.1, 0.5), (0.39, 0.1, 0.5), (0.4, 0.333, 0.75)):
+        batch, targets = learner.prepare(progress)
+        cells, landmarks = batch.next_observations[..., 0], batch.next_observations[..., 1]
+        distances = abs(cells - landmarks)
+        missing = distances if progress < 0.4 else (distances > 0).astype(np.float32)
+        # The landmark under an agent may have been visited before it came: no rewards then.
+        missing = np.where(batch.terminated, 0.0, missing)
+        np.testing.assert_allclose(batch.rewards, -scale * missing, rtol=1e-6)
+        assert len(np.unique(batch.rewards)) > 1
+        with torch.no_grad():
+            following = torch.from_numpy(batch.next_observations.reshape(-1, 3))
+            best = learner.target(following).max(dim=1).values.numpy().reshape(64, 4)
+        expected = batch.rewards + np.where(batch.terminated, 0.0, discount * best)
+        np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
+
+
 # -- memory ------------------------------------------------------------------------------------
 
 
