@@ -1,17 +1,29 @@
 """The parts a learner is made of: targets, memory, guidance, acting, and that they learn."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 
 from baselines import meta_dqn
+from baselines.experiment import Streams, Training
 from baselines.guidance import Guidance, GuidedPolicy, LinearSchedule
+from baselines.meta_dqn import Args, MetaLearner
 from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.options import preset_options
 from baselines.replay_memory import Batch, ReplayMemory
-from baselines.runs import RunFolder, StopSignals
 from mapp_env import Grid, make_grid
 
 LEFT, RIGHT, UP, DOWN = range(4)
+SQUARE = Grid.from_text("D..\n...\n...")
+
+
+def paper_learner(seed: int, n_agents: int, **changes: object) -> MetaLearner:
+    """Return a small learner of the paper's kind on a grid of nine cells, with one landmark."""
+    options = {"n_agents": n_agents, "n_landmarks": 1, "hidden_units": 64, **changes}
+    args = preset_options(Args, "paper", **options)
+    return MetaLearner(args, SQUARE, Streams.spawn(seed))
 
 
 def small_network(n_agents: int, seed: int, hidden_units: int = 64):
@@ -30,85 +42,170 @@ def test_targets_equal_hand_computed_ones():
     rewards = torch.tensor([-7.0, 0.0, -2.0])
     # A time-out is stored as "not terminated", like a step in the middle of an episode.
     terminated = torch.tensor([False, True, False])
-    targets = meta_dqn.td_targets(rewards, terminated, next_scores, 0.95)
+    best = meta_dqn.next_values(next_scores, next_scores, None)
+    targets = meta_dqn.td_targets(rewards, terminated, best, 0.95)
     expected = [[-7 + 0.95 * 4, -7 - 0.95], [0, 0], [-2 + 0.95 * 4, -2 - 0.95]]
     np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
 
 
 def test_update_is_the_gradient_of_the_huber_loss_of_the_chosen_scores():
-    """One update returns the mean Huber loss of the chosen scores, computed by hand."""
-    network, target = small_network(2, 0), small_network(2, 1)
+    """One update returns the mean Huber loss of the chosen scores, and is Adam's step down it."""
+    learner = paper_learner(0, 2, discount=0.9, batch_size=8)
+    learner.target.load_state_dict(small_network(2, 1).state_dict())
     rng = np.random.default_rng(0)
-    batch = Batch(
-        observations=rng.integers(0, 2, (8, 4)).astype(np.float32),
-        actions=rng.integers(0, 4, (8, 2)),
-        rewards=rng.normal(size=8).astype(np.float32) * 3,
-        next_observations=rng.integers(0, 2, (8, 4)).astype(np.float32),
-        terminated=rng.random(8) < 0.5,
-    )
+    for _ in range(20):
+        learner.remember(
+            rng.integers(0, 2, 4).astype(np.float32),
+            rng.integers(0, 4, 2),
+            3 * rng.normal(),
+            rng.integers(0, 2, 4).astype(np.float32),
+            rng.random() < 0.5,
+        )
+    batch = learner.memory.sample(8, copy.deepcopy(learner.rng))
+    network = copy.deepcopy(learner.network)
     with torch.no_grad():
-        scores = network(torch.from_numpy(batch.observations)).numpy()
-        next_scores = target(torch.from_numpy(batch.next_observations)).numpy()
+        next_scores = learner.target(torch.from_numpy(batch.next_observations[:, 0])).numpy()
+    scores = network(torch.from_numpy(batch.observations))
     losses = []
     for row in range(8):
         for agent in range(2):
-            goal = float(batch.rewards[row])
-            if not batch.terminated[row]:
+            goal = float(batch.rewards[row, 0])
+            if not batch.terminated[row, 0]:
                 goal += 0.9 * next_scores[row, agent].max()
-            error = abs(scores[row, agent, batch.actions[row, agent]] - goal)
+            error = (scores[row, agent, batch.actions[row, 0, agent]] - goal).abs()
             losses.append(0.5 * error**2 if error < 1 else error - 0.5)
-    before = {name: tensor.clone() for name, tensor in target.state_dict().items()}
+    assert min(losses) < 0.5 < max(losses)  # both the square and the line
+    by_hand = sum(losses) / len(losses)
     optimiser = torch.optim.Adam(network.parameters(), lr=0.001)
-    loss = meta_dqn.update(network, target, optimiser, batch, 0.9)
-    assert loss == pytest.approx(np.mean(losses), abs=1e-6)
-    assert all(torch.equal(before[name], t) for name, t in target.state_dict().items())
+    by_hand.backward()
+    optimiser.step()
+    before = {name: tensor.clone() for name, tensor in learner.target.state_dict().items()}
+    assert learner.update(0.0) == pytest.approx(by_hand.item(), abs=1e-6)
+    for name, expected in network.state_dict().items():
+        torch.testing.assert_close(
+            learner.network.state_dict()[name], expected, atol=1e-5, rtol=0.0
+        )
+    assert all(torch.equal(before[name], t) for name, t in learner.target.state_dict().items())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_two_step_chain_learns_its_known_scores(seed):
     """State 0 leads to state 1 for nothing, which ends with 1 for one action and 0 for others."""
-    network, target = small_network(1, seed), small_network(1, seed)
-    optimiser = torch.optim.Adam(network.parameters(), lr=0.003)
-    rng = np.random.default_rng(seed)
+    learner = paper_learner(seed, 1, learning_rate=0.003, discount=0.9, target_interval=20)
     states = np.array([[0, 0, 0], [8, 0, 0]], np.float32)
-    for step in range(400):
-        where = rng.integers(2, size=32)
-        actions = rng.integers(4, size=(32, 1))
-        batch = Batch(
-            observations=states[where],
-            actions=actions,
-            rewards=((where == 1) & (actions[:, 0] == UP)).astype(np.float32),
-            next_observations=states[np.ones(32, int)],
-            terminated=where == 1,
-        )
-        meta_dqn.update(network, target, optimiser, batch, 0.9)
-        if step % 20 == 0:
-            target.load_state_dict(network.state_dict())
+    for where in range(2):
+        for action in range(4):
+            reward = float(where == 1 and action == UP)
+            learner.remember(states[where], np.array([action]), reward, states[1], where == 1)
+    for _ in range(400):
+        learner.update(0.0)
     with torch.no_grad():
-        scores = network(torch.from_numpy(states))[:, 0].numpy()
+        scores = learner.network(torch.from_numpy(states))[:, 0].numpy()
     np.testing.assert_allclose(scores, [[0.9] * 4, [0, 0, 1, 0]], atol=0.1)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_team_reward_teaches_each_agent_its_own_action(seed):
     """Agents that share one reward, which depends on what they see, find their own best action."""
-    network = small_network(2, seed)
-    optimiser = torch.optim.Adam(network.parameters(), lr=0.003)
+    learner = paper_learner(seed, 2, learning_rate=0.003, batch_size=64)
     rng = np.random.default_rng(seed)
-    for _ in range(500):
-        flags = rng.integers(2, size=64)
-        observations = np.zeros((64, 4), np.float32)
-        observations[:, 3] = flags
-        actions = rng.integers(4, size=(64, 2))
+    for _ in range(3000):
+        flag = rng.integers(2)
+        observation = np.array([0, 0, 0, flag], np.float32)
+        actions = rng.integers(4, size=2)
         # The best actions are (LEFT, DOWN) without the flag, (RIGHT, UP) with it.
-        good = np.where(flags[:, None], [RIGHT, UP], [LEFT, DOWN])
-        rewards = (actions == good).sum(axis=1).astype(np.float32)
-        batch = Batch(observations, actions, rewards, observations, np.ones(64, np.bool_))
-        meta_dqn.update(network, network, optimiser, batch, 0.95)
-    with torch.no_grad():
-        seen = torch.tensor([[0.0, 0, 0, 0], [0, 0, 0, 1]])
-        greedy = network(seen).argmax(dim=-1).tolist()
+        good = [RIGHT, UP] if flag else [LEFT, DOWN]
+        learner.remember(observation, actions, float((actions == good).sum()), observation, True)
+    for _ in range(500):
+        learner.update(0.0)
+    greedy = [learner.act(np.array([0, 0, 0, flag], np.float32)).tolist() for flag in (0, 1)]
     assert greedy == [[LEFT, DOWN], [RIGHT, UP]]
+
+
+def fill(learner: MetaLearner) -> None:
+    """Tell a learner of some moves that are chance."""
+    rng = np.random.default_rng(0)
+    size = learner.spec.observation_size
+    for _ in range(40):
+        observation, following = rng.integers(0, 2, (2, size)).astype(np.float32)
+        actions = rng.integers(4, size=learner.spec.n_agents)
+        learner.remember(observation, actions, -1.0, following, False)
+
+
+def test_step_size_rises_and_falls():
+    """It rises over the warm-up in equal parts, and falls in a straight line to nothing."""
+
+    def rates(**changes):
+        learner = paper_learner(0, 1, batch_size=4, learning_rate=0.01, **changes)
+        fill(learner)
+        seen = []
+        for update in range(5):
+            learner.update(update / 5)
+            seen += [group["lr"] for group in learner.optimiser.param_groups]
+        return pytest.approx(seen)
+
+    assert rates() == [0.01] * 5
+    assert rates(learning_rate_falls=True) == [0.01, 0.008, 0.006, 0.004, 0.002]
+    assert rates(learning_rate_warmup=4) == [0.0025, 0.005, 0.0075, 0.01, 0.01]
+    both = {"learning_rate_warmup": 4, "learning_rate_falls": True}
+    assert rates(**both) == [0.0025, 0.004, 0.0045, 0.004, 0.002]
+
+
+def test_target_network_is_copied_or_follows():
+    """It is a copy every so many updates, or moves by its rate towards the network at each."""
+    learner = paper_learner(0, 1, batch_size=4, target_interval=3)
+    fill(learner)
+    for update in range(1, 8):
+        before = [tensor.clone() for tensor in learner.target_weights]
+        learner.update(0.0)
+        expected = learner.weights if update % 3 == 0 else before
+        assert all(map(torch.equal, learner.target_weights, expected))
+        assert not torch.equal(before[0], learner.weights[0])
+    learner = paper_learner(0, 1, batch_size=4, target_interval=0, target_rate=0.2)
+    fill(learner)
+    for _ in range(3):
+        before = [tensor.clone() for tensor in learner.target_weights]
+        learner.update(0.0)
+        for old, new, own in zip(before, learner.target_weights, learner.weights, strict=True):
+            torch.testing.assert_close(new, 0.8 * old + 0.2 * own.detach())
+
+
+def test_imagined_goal_changes_when_it_is_said_to():
+    """Up to a part of the training it is the env's reward, from then on the final one."""
+    args = Args(
+        n_agents=1,
+        n_landmarks=1,
+        hidden_units=8,
+        code_units=4,
+        batch_size=64,
+        tried_actions=4,
+        imagined_length=2,
+        discount=0.5,
+        final_discount=0.75,
+        final_from=0.4,
+    )
+    grid = Grid.from_text("D....")
+    learner = MetaLearner(args, grid, Streams.spawn(0))
+    for cell in range(5):
+        for action in range(4):
+            here, there = ([at, 0, 0] for at in (cell, grid.moves[cell, action]))
+            learner.remember(
+                np.array(here, np.float32), np.array([action]), 0.0, np.array(there), False
+            )
+    for progress, scale, discount in ((0.0, 0.1, 0.5), (0.39, 0.1, 0.5), (0.4, 0.333, 0.75)):
+        batch, targets = learner.prepare(progress)
+        cells, landmarks = batch.next_observations[..., 0], batch.next_observations[..., 1]
+        distances = abs(cells - landmarks)
+        missing = distances if progress < 0.4 else (distances > 0).astype(np.float32)
+        # The landmark under an agent may have been visited before it came: no rewards then.
+        missing = np.where(batch.terminated, 0.0, missing)
+        np.testing.assert_allclose(batch.rewards, -scale * missing, rtol=1e-6)
+        assert len(np.unique(batch.rewards)) > 1
+        with torch.no_grad():
+            following = torch.from_numpy(batch.next_observations.reshape(-1, 3))
+            best = learner.target(following).max(dim=1).values.numpy().reshape(64, 4)
+        expected = batch.rewards + np.where(batch.terminated, 0.0, discount * best)
+        np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
 
 
 # -- memory ------------------------------------------------------------------------------------
@@ -125,13 +222,13 @@ def test_memory_keeps_the_newest_and_forgets_the_oldest(n_added):
     for i in kept:
         row = Batch(*(array[i % 5] for array in memory.arrays))
         assert row.observations.tolist() == [i] * 3
-        assert row.actions.tolist() == [i, i + 1]
-        assert row.rewards == -i
-        assert row.next_observations.tolist() == [i + 0.5] * 3
-        assert row.terminated == (i % 3 == 0)
+        assert row.actions.tolist() == [[i, i + 1]]
+        assert row.rewards.tolist() == [-i]
+        assert row.next_observations.tolist() == [[i + 0.5] * 3]
+        assert row.terminated.tolist() == [i % 3 == 0]
     drawn = memory.sample(1000, np.random.default_rng(0))
-    assert set(-drawn.rewards.astype(int)) == set(kept)
-    assert (drawn.observations[:, 0] == -drawn.rewards).all()
+    assert set(-drawn.rewards[:, 0].astype(int)) == set(kept)
+    assert (drawn.observations[:, :1] == -drawn.rewards).all()
 
 
 def test_memory_sample_is_a_copy_and_follows_its_generator():
@@ -223,64 +320,145 @@ def test_schedule_goes_straight_to_its_end_and_stays():
 # -- acting and the loop -----------------------------------------------------------------------
 
 
-def test_epsilon_is_tossed_for_each_agent():
-    """Without exploration every agent takes its own argmax; with it, each explores on its own."""
-    network = small_network(2, 0)
-    observation = np.array([4, 4, 8, 0], np.float32)
-    with torch.no_grad():
-        greedy = network(torch.from_numpy(observation[None]))[0].argmax(dim=-1).numpy()
-    rng = np.random.default_rng(0)
-    assert (meta_dqn.choose_actions(network, observation, 0.0, rng) == greedy).all()
-    many = np.array([meta_dqn.choose_actions(network, observation, 0.4, rng) for _ in range(3000)])
-    other = many != greedy
-    assert other.mean(axis=0) == pytest.approx(0.4 * 3 / 4, abs=0.04)
-    assert other.all(axis=1).mean() == pytest.approx((0.4 * 3 / 4) ** 2, abs=0.03)
+class Recorder(MetaLearner):
+    """Learns nothing, and keeps what it was told and what it would have done."""
+
+    ready = False
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.told = []
+
+    def remember(self, observation, actions, reward, next_observation, terminated):
+        """Keep the actions beside the greedy ones."""
+        self.told.append((np.array(actions), self.act(observation)))
 
 
-def test_loop_stores_what_happened(tmp_path, monkeypatch):
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("epsilon", [0.0, 0.4])
+def test_epsilon_is_tossed_for_each_agent(preset, epsilon):
+    """Without exploration every agent takes its greedy action; with it, each explores alone."""
+    args = preset_options(
+        Args,
+        preset,
+        n_agents=2,
+        n_landmarks=1,
+        hidden_units=16,
+        epsilon_start=epsilon,
+        epsilon_end=epsilon,
+        guidance_start=0.0,
+        guidance_end=0.0,
+        n_problems=1,
+        episodes_per_problem=1000,
+    )
+    learner = Recorder(args, SQUARE, Streams.spawn(0))
+    training = Training(args, SQUARE, np.array([[8]]), learner)
+    while len(learner.told) < 3000:
+        training.advance()
+    taken, greedy = (np.array(side) for side in zip(*learner.told, strict=True))
+    other = taken != greedy
+    assert other.mean(axis=0) == pytest.approx(epsilon * 3 / 4, abs=0.04)
+    assert other.all(axis=1).mean() == pytest.approx((epsilon * 3 / 4) ** 2, abs=0.03)
+
+
+def test_loop_stores_what_happened():
     """Stored transitions chain, and are terminated only where every landmark is visited."""
-    memories = []
-
-    class Kept(ReplayMemory):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            memories.append(self)
-
-    monkeypatch.setattr(meta_dqn, "ReplayMemory", Kept)
-    args = meta_dqn.Args(max_cycles=12, n_landmarks=2, hidden_units=8, memory_size=1000)
+    args = preset_options(
+        Args,
+        "paper",
+        max_cycles=12,
+        n_landmarks=2,
+        hidden_units=8,
+        memory_size=1000,
+        n_problems=3,
+        episodes_per_problem=8,
+    )
     grid = make_grid("paper-7x7")
     problems = np.array([[17, 30], [0, 48], [25, 31]])
-    args = meta_dqn.Args(**{**vars(args), "n_problems": 3, "episodes_per_problem": 8})
-    run = RunFolder(tmp_path / "run", meta_dqn.METRICS)
-    training = meta_dqn.train(args, grid, problems, run, StopSignals())
-    run.close()
-    (memory,) = memories
+    learner = MetaLearner(args, grid, Streams.spawn(0))
+    training = Training(args, grid, problems, learner)
+    rows = []
+    while not training.finished:
+        row = training.advance()
+        rows += [row] if row else []
+    memory = learner.memory
     stored = Batch(*(array[: len(memory)] for array in memory.arrays))
-    assert training.episodes == 24
-    assert training.steps == len(memory)
-    all_visited = stored.next_observations[:, -2:].all(axis=1)
-    np.testing.assert_array_equal(stored.terminated, all_visited)
-    assert ((stored.rewards == 0) == all_visited).all()
-    begins = (stored.observations[:, :3] == grid.depot).all(axis=1)
-    chained = (stored.observations[1:] == stored.next_observations[:-1]).all(axis=1)
-    assert (chained | begins[1:]).all()
-    assert 0 < all_visited.sum() < 24  # both ends occur: visited, and out of time
+    following, terminated = stored.next_observations[:, 0], stored.terminated[:, 0]
+    assert [row["episode"] for row in rows] == list(range(1, 25))
+    assert training.now.steps == sum(row["steps"] for row in rows) == len(memory)
+    all_visited = following[:, -2:].all(axis=1)
+    np.testing.assert_array_equal(terminated, all_visited)
+    assert ((stored.rewards[:, 0] == 0) == all_visited).all()
+    # Nothing is stored of the way from an episode's last state to the next one's first.
+    begins = np.cumsum([0, *(row["steps"] for row in rows)])
+    assert (stored.observations[begins[:-1], :3] == grid.depot).all()
+    inside = np.setdiff1d(np.arange(1, len(memory)), begins)
+    np.testing.assert_array_equal(stored.observations[inside], following[inside - 1])
+    starts = np.repeat(problems, 8, axis=0)
+    np.testing.assert_array_equal(stored.observations[begins[:-1], 3:5], starts)
+    ends = terminated[begins[1:] - 1]
+    assert [row["solved"] for row in rows] == ends.astype(int).tolist()
+    assert 0 < all_visited.sum() == ends.sum() < 24  # both ends occur: visited, and out of time
     moves = np.asarray(grid.moves)
     np.testing.assert_array_equal(
-        moves[stored.observations[:, :3].astype(int), stored.actions],
-        stored.next_observations[:, :3],
+        moves[stored.observations[:, :3].astype(int), stored.actions[:, 0]], following[:, :3]
     )
 
 
-def test_training_leaves_the_global_generators_alone(tmp_path):
+@pytest.mark.parametrize(
+    ("preset", "due"), [("paper", {"update_interval": 4}), ("default", {"updates_per_episode": 5})]
+)
+def test_updates_come_when_they_are_due(preset, due):
+    """One every so many steps or so many after each episode, none before learning starts."""
+    args = preset_options(
+        Args,
+        preset,
+        n_problems=1,
+        episodes_per_problem=6,
+        hidden_units=8,
+        code_units=4,
+        batch_size=4,
+        learning_starts=50,
+        max_cycles=18,  # no multiple of 4: an episode's steps are not all steps
+        **due,
+    )
+    problems = np.array([[0, 6, 20, 42, 48]])
+    grid = make_grid("paper-7x7")
+    training = Training(args, grid, problems, MetaLearner(args, grid, Streams.spawn(0)))
+    steps = 0
+    while not training.finished:
+        row = training.advance()
+        if row is None:
+            continue
+        before, steps = steps, steps + row["steps"]
+        if preset == "paper":
+            expected = sum(step >= 50 and step % 4 == 0 for step in range(before + 1, steps + 1))
+        else:
+            expected = 5 * (steps >= 50)
+        assert row["updates"] == expected
+        assert (row["loss"] == "") == (expected == 0)
+    assert training.learner.updates > 0
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_training_leaves_the_global_generators_alone(preset):
     """Neither NumPy's nor PyTorch's global generator moves, whatever is trained."""
-    args = meta_dqn.Args(
-        n_problems=1, episodes_per_problem=2, hidden_units=8, learning_starts=8, max_cycles=20
+    args = preset_options(
+        Args,
+        preset,
+        n_problems=1,
+        episodes_per_problem=2,
+        hidden_units=8,
+        learning_starts=8,
+        max_cycles=20,
     )
     before = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    run = RunFolder(tmp_path / "run", meta_dqn.METRICS)
-    meta_dqn.train(args, make_grid("paper-7x7"), np.array([[0, 6, 20, 42, 48]]), run, StopSignals())
-    run.close()
+    grid = make_grid("paper-7x7")
+    learner = MetaLearner(args, grid, Streams.spawn(0))
+    training = Training(args, grid, np.array([[0, 6, 20, 42, 48]]), learner)
+    while not training.finished:
+        training.advance()
+    assert learner.updates > 0
     assert torch.equal(before[0], torch.get_rng_state())
     np.testing.assert_array_equal(before[1], np.random.get_state()[1])  # noqa: NPY002
 
@@ -305,6 +483,25 @@ def test_training_leaves_the_global_generators_alone(tmp_path):
         ("threads", 0),
         ("preset", "nonsense"),
         ("reward", "money"),
+        ("network", "deep"),
+        ("outputs", "both"),
+        ("replay", "none"),
+        ("final_reward", "more"),
+        ("double", 1),
+        ("dueling", "no"),
+        ("prefetch", 0),
+        ("code_units", 0),
+        ("learning_rate_warmup", -1),
+        ("reward_scale", 0.0),
+        ("huber", 0.0),
+        ("target_rate", 1.5),
+        ("final_from", float("nan")),
+        ("tried_actions", 0),
+        ("temperature", 0.0),
+        ("imagined_exploration", 1.1),
+        ("imagined_from_depot", -0.1),
+        ("imagined_length", 0),
+        ("checkpoint_seconds", -1.0),
     ],
 )
 def test_bad_options_are_refused_by_name(name, value):

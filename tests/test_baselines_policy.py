@@ -89,8 +89,8 @@ def test_weights_of_other_shapes_dtypes_or_names_are_refused(tmp_path, weights):
     shape = {**weights, "layers.0.weight": torch.zeros(16, 12)}
     with pytest.raises(ValueError, match=r"layers\.0\.weight: got .*\(16, 12\)"):
         load_policy(write(tmp_path / "shape", shape))
-    dtype = {**weights, "layers.4.bias": weights["layers.4.bias"].double()}
-    with pytest.raises(ValueError, match=r"layers\.4\.bias: got torch\.float64"):
+    dtype = {**weights, "head.advantages.bias": weights["head.advantages.bias"].double()}
+    with pytest.raises(ValueError, match=r"head\.advantages\.bias: got torch\.float64"):
         load_policy(write(tmp_path / "dtype", dtype))
     extra = {**weights, "surprise": torch.zeros(1)}
     with pytest.raises(ValueError, match=r"unknown .*surprise"):

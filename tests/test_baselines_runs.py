@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,9 @@ import numpy as np
 import pytest
 import tyro
 
-from baselines import evaluate, meta_dqn
+from baselines import evaluate, experiment, meta_dqn
 from baselines.figures import draw_learning_curves
+from baselines.options import preset_options
 from baselines.policy import load_policy
 from baselines.runs import RunFolder, read_config, read_metrics, write_atomically
 from mapp_env import Grid
@@ -27,6 +29,20 @@ TINY = (
     "--hidden-units=16",
     "--learning-starts=20",
     "--evaluation-problems=20",
+)
+PROMISED = (
+    ".lock",
+    "checkpoints",
+    "config.json",
+    "evaluation.csv",
+    "evaluation.md",
+    "fig2_reward.png",
+    "fig3_steps.png",
+    "fig4a_routes.png",
+    "fig4b_routes.png",
+    "metrics.csv",
+    "policy.safetensors",
+    "timing.json",
 )
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
 
@@ -44,10 +60,11 @@ def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
 
 @pytest.fixture(scope="module")
 def two_runs(tmp_path_factory):
-    """One tiny run as a script, the same again as a module, at the same time."""
+    """One tiny run of the paper's preset as a script, again as a module, at the same time."""
     folder = tmp_path_factory.mktemp("runs")
-    script = start(str(ROOT / "baselines" / "meta_dqn.py"), *TINY, "--out=a", cwd=folder)
-    module = start("-m", "baselines.meta_dqn", *TINY, "--out=b", cwd=folder)
+    paper = (*TINY, "--preset=paper")
+    script = start(str(ROOT / "baselines" / "meta_dqn.py"), *paper, "--out=a", cwd=folder)
+    module = start("-m", "baselines.meta_dqn", *paper, "--out=b", cwd=folder)
     outputs = []
     for process in (script, module):
         output, errors = process.communicate(timeout=120)
@@ -61,19 +78,7 @@ def test_run_leaves_all_it_promises(two_runs):
     """Config, metrics, weights, table, figures and times are there and readable."""
     folder, (output, _) = two_runs
     run = folder / "a"
-    assert sorted(path.name for path in run.iterdir()) == [
-        ".lock",
-        "config.json",
-        "evaluation.csv",
-        "evaluation.md",
-        "fig2_reward.png",
-        "fig3_steps.png",
-        "fig4a_routes.png",
-        "fig4b_routes.png",
-        "metrics.csv",
-        "policy.safetensors",
-        "timing.json",
-    ]
+    assert sorted(path.name for path in run.iterdir()) == sorted(PROMISED)
     config = read_config(run)
     assert config["options"]["seed"] == 0
     assert config["options"]["n_problems"] == 2
@@ -82,7 +87,7 @@ def test_run_leaves_all_it_promises(two_runs):
     assert {"python", "numpy", "torch", "mapp_env"} <= set(config["environment"]["versions"])
 
     rows = list(csv.DictReader((run / "metrics.csv").read_text().splitlines()))
-    assert tuple(rows[0]) == meta_dqn.METRICS
+    assert tuple(rows[0]) == experiment.METRICS
     assert [row["episode"] for row in rows] == list("123456")
     assert [row["problem"] for row in rows] == list("111222")
     for row in rows:
@@ -91,15 +96,44 @@ def test_run_leaves_all_it_promises(two_runs):
         assert float(row["reward"]) <= 0
     assert float(rows[0]["guidance"]) == 1.0
     assert float(rows[-1]["loss"]) > 0
+    assert int(rows[-1]["updates"]) > 0
 
     for name in ("fig2_reward.png", "fig3_steps.png", "fig4a_routes.png", "fig4b_routes.png"):
         assert (run / name).read_bytes().startswith(b"\x89PNG")
     timing = json.loads((run / "timing.json").read_text())
     assert timing["episodes"] == 6
     assert timing["steps"] == sum(int(row["steps"]) for row in rows)
+    assert timing["updates"] == sum(int(row["updates"]) for row in rows)
     assert (run / "evaluation.md").read_text() in output
     for label in ("network alone", "guidance", "random", "nearest landmark"):
         assert label in output
+
+
+def test_default_preset_leaves_all_it_promises(tmp_path, capsys):
+    """The default preset's run folder holds the same files, and no rows of guidance."""
+    args = meta_dqn.Args(
+        n_problems=2,
+        episodes_per_problem=3,
+        hidden_units=16,
+        code_units=8,
+        learning_starts=20,
+        updates_per_episode=3,
+        batch_size=16,
+        evaluation_problems=20,
+        out=tmp_path / "run",
+    )
+    assert meta_dqn.main(args) == 0
+    names = sorted(path.name for path in args.out.iterdir())
+    assert names == sorted(PROMISED)
+    columns = read_metrics(args.out)
+    assert tuple(columns) == experiment.METRICS
+    assert columns["guidance"] == [0.0] * 6
+    assert columns["updates"][-1] == 3
+    rows = list(csv.reader((args.out / "evaluation.csv").read_text().splitlines()))[1:]
+    labels = ["network alone", "random", "nearest landmark", "optimum of each cost"]
+    assert [row[0] for row in rows] == labels
+    assert (args.out / "evaluation.md").read_text() in capsys.readouterr().out
+    assert load_policy(args.out).spec.kind == "pairs"
 
 
 def test_same_seed_same_bytes(two_runs):
@@ -131,10 +165,13 @@ def test_another_seed_another_run(two_runs, tmp_path):
     assert weights[0] != weights[1]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopped_run_is_readable(tmp_path, number, code):
+@pytest.mark.parametrize(
+    ("number", "code", "preset"), [(signal.SIGINT, 130, "default"), (signal.SIGTERM, 143, "paper")]
+)
+def test_stopped_run_is_readable(tmp_path, number, code, preset):
     """Ctrl-C leaves whole rows, weights that load, a clear last line and its exit code."""
-    process = start("-m", "baselines.meta_dqn", "--hidden-units=16", "--out=run", cwd=tmp_path)
+    options = (f"--preset={preset}", "--hidden-units=16", "--out=run")
+    process = start("-m", "baselines.meta_dqn", *options, cwd=tmp_path)
     run = tmp_path / "run"
     metrics = run / "metrics.csv"
     deadline = time.monotonic() + 60
@@ -146,7 +183,7 @@ def test_stopped_run_is_readable(tmp_path, number, code):
     output, errors = process.communicate(timeout=30)
     assert process.returncode == code, errors
     assert errors == ""
-    assert output.splitlines()[-1] == "stopped early; what there is so far is in run"
+    assert output.splitlines()[-1] == "stopped early; go on with --resume run"
     columns = read_metrics(run)
     assert columns["episode"] == list(range(1, len(columns["episode"]) + 1))
     assert metrics.read_text().endswith("\n")
@@ -171,6 +208,9 @@ def test_impossible_options_leave_no_folder(tmp_path):
     for options in ({"n_landmarks": 41}, {"grid": "nowhere"}, {"n_problems": 700_000}):
         with pytest.raises(ValueError, match=r"n_landmarks|nowhere|n_problems"):
             meta_dqn.main(meta_dqn.Args(out=tmp_path / "run", **options))
+    (tmp_path / "large.txt").write_text(Grid(np.zeros((65, 65), dtype=bool)).to_text())
+    with pytest.raises(ValueError, match=r"'pairs' would have .* weights on 4,225 cells"):
+        meta_dqn.main(meta_dqn.Args(grid=str(tmp_path / "large.txt"), out=tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
 
@@ -181,12 +221,13 @@ def test_help_teaches_every_option(args, capsys):
         tyro.cli(args, args=["--help"])
     assert end.value.code == 0
     text = capsys.readouterr().out
-    helps = text.split("--")[1:]
+    # A new option begins where a line does; a flag has its opposite beside it.
+    helps = re.split(r"\n\W*--(?=[a-z])", text)[1:]
     for field in fields(args):
         name = field.name.replace("_", "-")
-        own = [part for part in helps if part.split()[:1] == [name]]
-        assert own, name
-        words = own[-1].replace("│", " ").split("(default")[0].split()
+        own = [part for part in helps if part.split()[0].rstrip(",") == name]
+        assert len(own) == 1, name
+        words = re.sub(r"[│|]", " ", own[0]).split("(default")[0].split()
         assert len(words) > 4, f"{name} is not explained"
 
 
@@ -259,7 +300,9 @@ def test_large_grid_has_no_nearest_landmark_row(tmp_path, capsys):
     (tmp_path / "large.txt").write_text(Grid(np.zeros((65, 65), dtype=bool)).to_text())
     grid = str(tmp_path / "large.txt")
     run = tmp_path / "run"
-    args = meta_dqn.Args(grid=grid, out=run, evaluation_problems=3, **SHORT)
+    args = preset_options(
+        meta_dqn.Args, "paper", grid=grid, out=run, evaluation_problems=3, **SHORT
+    )
     assert meta_dqn.main(args) == 0
     output = capsys.readouterr().out
     assert output.count("no row for the nearest landmark: the grid has more than 4,096 cells") == 1
@@ -275,7 +318,8 @@ def test_evaluation_takes_the_unseen_problems_there_are(tmp_path, capsys, n_prob
     options = {**SHORT, "n_problems": n_problems, "episodes_per_problem": 1}
     run = tmp_path / "run"
     task = {"grid": str(tmp_path / "tiny.txt"), "n_agents": 1, "n_landmarks": 2}
-    assert meta_dqn.main(meta_dqn.Args(out=run, **task, **options)) == 0
+    args = preset_options(meta_dqn.Args, "paper", out=run, **task, **options)
+    assert meta_dqn.main(args) == 0
     line = f"{left} of 1,000 evaluation problems: there are no more unseen ones"
     assert capsys.readouterr().out.splitlines()[0] == line
     assert (run / "evaluation.csv").exists() == (left > 0)
@@ -331,7 +375,7 @@ def test_weights_of_another_grid_are_refused_by_name(two_runs, tmp_path):
 @pytest.mark.parametrize("column", ["episode", "problem", "steps", "reward"])
 def test_curves_without_a_column_are_refused_by_name(tmp_path, column):
     """A metrics file that lacks what is drawn is refused with its path and the column."""
-    columns = [name for name in meta_dqn.METRICS if name != column]
+    columns = [name for name in experiment.METRICS if name != column]
     rows = [",".join(columns), ",".join("1" for _ in columns), ""]
     (tmp_path / "metrics.csv").write_text("\n".join(rows))
     with pytest.raises(ValueError, match=rf"metrics\.csv: no column {column}$"):
