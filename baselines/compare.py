@@ -189,7 +189,8 @@ def check_folder(training: Training) -> None:
         return
     for path in list(folder.iterdir()):
         # Killed before its config was written.
-        if path.name not in (METRICS_FILE, LOCK_FILE) and not path.name.startswith("."):
+        own = path.name in (METRICS_FILE, LOCK_FILE) or path.name.startswith(f".{CONFIG_FILE}.")
+        if not own:
             raise ValueError(f"out: {folder} holds something else: {path.name}")
         path.unlink()
 
