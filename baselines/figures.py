@@ -174,7 +174,7 @@ def draw_comparison(
         row[0].set(ylabel=f"preset {preset}\nreturn, training", xlabel="Episode")
         row[1].set(ylabel="solved %, training", xlabel="Episode", ylim=(-3, 103))
         row[2].set(xlabel="solved %, unseen problems", xlim=(-3, 103))
-        row[3].set(xlabel="gap %, solved unseen problems")
+        row[3].set(xlabel="gap %, those solved")
         row[3].set_xlim(left=min(0.0, row[3].get_xlim()[0]))
         for axes in row[2:]:
             axes.set_yticks([-i for i in range(len(shown))], [s.learner for s in shown])
