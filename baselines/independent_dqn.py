@@ -258,10 +258,16 @@ class AgentLearner:
             seen = torch.from_numpy(batch.next_observations[:, 0])
             values = self.target(seen)[:, 0]
             chooser = self.network(seen)[:, 0] if args.double else values
+            following = next_values(values, chooser, None)
+            if self.relabelled is not None:
+                # No reward of the rules is above 0, so no value is. Without this bound the values
+                # of a learner can feed on themselves and grow past all measure: where it has not
+                # been with the others, nothing it experienced contradicts them.
+                following = following.clamp(max=0.0)
             targets = td_targets(
                 scale * torch.from_numpy(batch.rewards[:, 0]),
                 torch.from_numpy(batch.terminated[:, 0]),
-                next_values(values, chooser, None),
+                following,
                 goal.discount,
             )
         return batch, targets.view(*batch.rewards.shape)

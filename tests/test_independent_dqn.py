@@ -191,6 +191,28 @@ def test_team_reward_teaches_each_agent_its_own_action(seed):
     assert greedy == [[LEFT, DOWN], [RIGHT, UP]]
 
 
+@pytest.mark.parametrize("share", [False, True])
+def test_no_target_is_above_what_the_rules_can_bring(share):
+    """However high a network's values have become, targets of relabelled transitions are 0 at most.
+
+    Below that they are the reward and the discounted best next value of the target network.
+    """
+    team = make("default", share_parameters=share)
+    for transition in walk(np.random.default_rng(0), 200):
+        team.remember(*transition)
+    for learner in team.learners:
+        for height in (100.0, -100.0):
+            with torch.no_grad():
+                learner.target.head.advantages.bias.fill_(height)
+            batch, targets = learner.prepare(0.0)
+            assert (targets <= 0).all()
+            with torch.no_grad():
+                best = learner.target(torch.from_numpy(batch.next_observations[:, 0]))[:, 0]
+            best = best.max(dim=1).values.clamp(max=0).numpy()
+            going_on = 0.95 * best * ~batch.terminated[:, 0]
+            np.testing.assert_allclose(targets[:, 0], batch.rewards[:, 0] + going_on, rtol=1e-5)
+
+
 # -- relabelled replay -------------------------------------------------------------------------
 
 
