@@ -8,9 +8,10 @@ Figures 2 and 3 (reward and steps per episode) are read from metrics.csv, so the
 again from any run, a stopped one too. Figure 4 (routes) is drawn when a training ends.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -32,6 +33,7 @@ ROUTES_FILES = ("fig4a_routes.png", "fig4b_routes.png")
 DRAWN_COLUMNS = ("episode", "problem", "steps", "reward")
 EPISODE_COLOUR = "#9db8d2"
 MEAN_COLOUR = "#123a63"
+LEARNER_COLOURS = ("#123a63", "#d1682c", "#3b8f5a")
 
 
 def draw_learning_curves(folder: Path, window: int = 30) -> list[Path]:
@@ -114,6 +116,78 @@ def draw_routes(folder: Path, evaluations: dict[str, Evaluation]) -> list[Path]:
         plans["optimum" if best.status == "optimal" else "best known"] = best
         compare_plans(problem, plans, folder / name)
     return [folder / name for name in names]
+
+
+def draw_comparison(
+    folder: Path,
+    summaries: Sequence[Any],
+    interval: Callable[[np.ndarray], Any],
+    window: int = 30,
+) -> Path:
+    """Draw a comparison: learning curves and final figures over the seeds, a row per preset.
+
+    Parameters
+    ----------
+    folder
+        Where comparison.png is written.
+    summaries
+        A ``compare.Summary`` for each learner under each preset.
+    interval
+        Gives the mean over the first axis, and its interval: ``compare.interval``.
+    window
+        Episodes in the running mean of each seed.
+    """
+    presets = list(dict.fromkeys(summary.preset for summary in summaries))
+    learners = list(dict.fromkeys(summary.learner for summary in summaries))
+    figure, grid = plt.subplots(
+        len(presets),
+        4,
+        figsize=(14.0, 3.2 * len(presets)),
+        layout="constrained",
+        squeeze=False,
+        width_ratios=(3, 3, 2, 2),
+    )
+    for preset, row in zip(presets, grid, strict=True):
+        shown = [summary for summary in summaries if summary.preset == preset]
+        for summary in shown:
+            colour = LEARNER_COLOURS[learners.index(summary.learner) % len(LEARNER_COLOURS)]
+            for axes, name, factor in ((row[0], "returns", 1.0), (row[1], "solved", 100.0)):
+                curves = [getattr(outcome, name) for outcome in summary.outcomes]
+                width = min(window, min(map(len, curves)))
+                smooth = [np.convolve(c, np.ones(width) / width, mode="valid") for c in curves]
+                found = interval(factor * np.array(smooth))
+                episodes = np.arange(width, width + len(found.mean))
+                axes.plot(episodes, found.mean, color=colour, label=summary.learner)
+                if found.n > 1:
+                    axes.fill_between(
+                        episodes, found.low, found.high, color=colour, alpha=0.2, linewidth=0
+                    )
+            height = -shown.index(summary)
+            for axes, name in ((row[2], "solved %"), (row[3], "gap %")):
+                found = summary.measures[name]
+                values = [outcome.measures[name] for outcome in summary.outcomes]
+                axes.plot(values, [height] * len(values), "|", color=colour, alpha=0.6)
+                if found.n:
+                    axes.plot(found.mean, height, "o", color=colour)
+                if found.n > 1:
+                    axes.plot([found.low, found.high], [height] * 2, color=colour, linewidth=3)
+        row[0].set(ylabel=f"preset {preset}\nreturn, training", xlabel="Episode")
+        row[1].set(ylabel="solved %, training", xlabel="Episode", ylim=(-3, 103))
+        row[2].set(xlabel="solved %, unseen problems", xlim=(-3, 103))
+        row[3].set(xlabel="gap %, those solved")
+        row[3].set_xlim(left=min(0.0, row[3].get_xlim()[0]))
+        for axes in row[2:]:
+            axes.set_yticks([-i for i in range(len(shown))], [s.learner for s in shown])
+            axes.set_ylim(-len(shown) + 0.5, 0.5)
+        for axes in row:
+            axes.spines[["top", "right"]].set_visible(False)
+    grid[0, 0].legend(frameon=False, fontsize="small")
+    figure.suptitle(
+        f"Interquartile means over seeds, 95 % bootstrap intervals; curves: mean of {window} "
+        "episodes",
+        fontsize="medium",
+    )
+    return _save(figure, folder / "comparison.png")
 
 
 def _save(figure: Figure, path: Path) -> Path:

@@ -19,6 +19,7 @@ MAX_WEIGHTS = 20_000_000  # numbers in a network: 76 MiB
 MAX_JOINT_ACTIONS = 1024
 
 OUTPUTS = ("agents", "joint")
+TEAMS = ("one", "independent", "shared")
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class NetworkSpec:
     dueling: bool = False  # a value and advantages (Wang et al. 2016) in place of values
     code_units: int = 64  # of "pairs": numbers that describe an agent among the landmarks
     landmark_units: int = 0  # of "pairs": numbers that describe a landmark among the agents
+    team: str = "one"  # one network for all agents, one for each, or one that each uses by itself
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, tuple(NETWORKS))
@@ -47,6 +49,9 @@ class NetworkSpec:
         check_flag("dueling", self.dueling)
         check_count("code_units", self.code_units, 1, 4096)
         check_count("landmark_units", self.landmark_units, 0, 4096)
+        check_choice("team", self.team, TEAMS)
+        if self.team != "one":
+            check_choice("outputs", self.outputs, ("agents",))
         if self.outputs == "joint" and self.n_joint_actions > MAX_JOINT_ACTIONS:
             raise ValueError(
                 f"outputs must be 'agents' for {self.n_agents} agents: 'joint' would have "
@@ -54,13 +59,11 @@ class NetworkSpec:
             )
         if self.kind == "pairs":
             check_count("n_agents", self.n_agents, 1, MAX_SORTED_AGENTS)
-            units = self.code_units + self.n_agents * self.landmark_units
-            pairs = self.n_cells * (self.n_cells + 1) * units
-            if pairs > MAX_WEIGHTS:
-                raise ValueError(
-                    f"kind 'pairs' would have {pairs:,} weights on {self.n_cells:,} cells, allowed "
-                    f"are {MAX_WEIGHTS:,}"
-                )
+        if self.n_weights > MAX_WEIGHTS:
+            raise ValueError(
+                f"kind {self.kind!r} would have {self.n_weights:,} weights on {self.n_cells:,} "
+                f"cells, allowed are {MAX_WEIGHTS:,}"
+            )
 
     @property
     def observation_size(self) -> int:
@@ -79,6 +82,33 @@ class NetworkSpec:
             return (self.n_joint_actions,)
         return (self.n_agents, self.n_actions)
 
+    @property
+    def head_shape(self) -> tuple[int, ...]:
+        """Shape of what one network of the team gives for one observation."""
+        return self.values_shape if self.team == "one" else (1, self.n_actions)
+
+    @property
+    def n_inputs(self) -> int:
+        """Numbers that one network of the team is given: shared, also whose turn it is."""
+        return self.observation_size + (self.n_agents if self.team == "shared" else 0)
+
+    @property
+    def n_weights(self) -> int:
+        """Weights of all networks together."""
+        hidden, shape = self.hidden_units, self.head_shape
+        last = (hidden + 1) * math.prod(shape)
+        if self.dueling:
+            last += (hidden + 1) * (shape[0] if len(shape) == 2 else 1)
+        if self.kind == "paper":
+            first = (self.n_inputs + 1) * hidden + (hidden + 1) * hidden
+        else:
+            first = self.n_cells * (self.n_cells + 2) * self.code_units
+            first += (self.n_cells + 1 + self.n_agents * self.code_units + 1) * hidden
+            first += (self.n_inputs - self.observation_size) * hidden
+            crossed = self.n_agents * self.n_cells * (self.n_cells + 1)
+            first += self.landmark_units * (crossed + hidden)
+        return (self.n_agents if self.team == "independent" else 1) * (first + last)
+
     def as_dict(self) -> dict[str, int | str | bool]:
         """Return the fields as a dictionary ready for JSON."""
         return asdict(self)
@@ -89,7 +119,7 @@ class Head(nn.Module):
 
     def __init__(self, spec: NetworkSpec, generator: torch.Generator | None) -> None:
         super().__init__()
-        self.shape = spec.values_shape
+        self.shape = spec.head_shape
         self.advantages = linear(spec.hidden_units, math.prod(self.shape), generator)
         n_values = self.shape[0] if len(self.shape) == 2 else 1
         self.value = linear(spec.hidden_units, n_values, generator) if spec.dueling else None
@@ -118,11 +148,11 @@ class PaperNetwork(nn.Module):
         super().__init__()
         self.spec = spec
         n_cell_inputs = spec.n_agents + spec.n_landmarks
-        scale = torch.ones(spec.observation_size)
+        scale = torch.ones(spec.n_inputs)
         scale[:n_cell_inputs] = 1.0 / (spec.n_cells - 1)
         self.register_buffer("scale", scale, persistent=False)
         self.layers = nn.Sequential(
-            linear(spec.observation_size, spec.hidden_units, generator),
+            linear(spec.n_inputs, spec.hidden_units, generator),
             nn.ReLU(),
             linear(spec.hidden_units, spec.hidden_units, generator),
             nn.ReLU(),
@@ -149,6 +179,9 @@ class PairsNetwork(nn.Module):
 
     - to rename landmarks changes nothing, and where the visited ones stand does not matter;
     - to rename agents renames their actions.
+
+    One agent's network in a team keeps the agents in the order they are given in, so that it can
+    tell itself from the others.
     """
 
     places: Tensor
@@ -171,6 +204,7 @@ class PairsNetwork(nn.Module):
             n_codes += spec.landmark_units
         self.hidden = linear(n_codes, spec.hidden_units, generator)
         self.head = Head(spec, generator)
+        self.whose = bag(n, spec.hidden_units, 0.1, generator) if spec.team == "shared" else None
         self.register_buffer("places", n ** torch.arange(n), persistent=False)
         self.register_buffer("orders", _joint_actions_by_order(spec), persistent=False)
 
@@ -178,8 +212,11 @@ class PairsNetwork(nn.Module):
         """Return action values, (B, N, A) or (B, A ** N), of global observations (B, N + 2K)."""
         n, k = self.spec.n_agents, self.spec.n_landmarks
         numbers = observations.long()
-        cells, order = numbers[:, :n].sort(dim=1, stable=True)
-        landmarks = torch.where(numbers[:, n + k :] > 0, self.spec.n_cells, numbers[:, n : n + k])
+        cells = numbers[:, :n]
+        if self.spec.team == "one":
+            cells, order = cells.sort(dim=1, stable=True)
+        flags = numbers[:, n + k : n + 2 * k]
+        landmarks = torch.where(flags > 0, self.spec.n_cells, numbers[:, n : n + k])
         pairs = cells[:, :, None] * (self.spec.n_cells + 1) + landmarks[:, None, :]
         codes = self.pairs(pairs.view(-1, k)) + self.cell(cells.reshape(-1, 1))
         codes = torch.relu(codes).view(-1, n * self.spec.code_units)
@@ -187,8 +224,12 @@ class PairsNetwork(nn.Module):
             seen = (pairs + self.slots[:, None]).transpose(1, 2).reshape(-1, n)
             crossed = torch.relu(self.crossed(seen)).view(-1, k, self.spec.landmark_units).sum(1)
             codes = torch.cat((codes, crossed), 1)
-        hidden = torch.relu(self.hidden(codes) + self.unvisited(landmarks))
-        values = self.head(hidden)
+        hidden = self.hidden(codes) + self.unvisited(landmarks)
+        if self.whose is not None:
+            hidden = hidden + self.whose(numbers[:, n + 2 * k :].argmax(dim=1, keepdim=True))
+        values: Tensor = self.head(torch.relu(hidden))
+        if self.spec.team != "one":
+            return values
         if self.spec.outputs == "joint":
             return values.gather(1, self.orders[(order * self.places).sum(1)])
         rank = order.argsort(dim=1)
@@ -213,7 +254,52 @@ def _joint_actions_by_order(spec: NetworkSpec) -> Tensor:
 
 
 NETWORKS = {"paper": PaperNetwork, "pairs": PairsNetwork}
-Network = PaperNetwork | PairsNetwork
+
+
+class Team(nn.Module):
+    """Networks of agents that act for themselves: one for each agent, or one that each uses.
+
+    An agent's network gives values of this agent's own actions. With one for each, all see the
+    observation as it is. A shared one is told whose turn it is (:func:`view`).
+    """
+
+    def __init__(self, spec: NetworkSpec, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.spec = spec
+        n_networks = spec.n_agents if spec.team == "independent" else 1
+        # One after the other from one generator: no two start alike.
+        self.members = nn.ModuleList(
+            NETWORKS[spec.kind](spec, generator) for _ in range(n_networks)
+        )
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return each agent's action values (B, N, A) of global observations (B, N + 2K)."""
+        values = []
+        for agent in range(self.spec.n_agents):
+            seen = observations
+            if self.spec.team == "shared":
+                seen = torch.from_numpy(view(observations.numpy(), agent, self.spec))
+            values.append(self.members[agent % len(self.members)](seen))
+        return torch.cat(values, dim=1)
+
+
+def view(observations: np.ndarray, agent: int, spec: NetworkSpec) -> np.ndarray:
+    """Return global observations (..., N + 2K) as an agent's network in a team gets them.
+
+    A network of one's own gets them as they are. A shared one gets the agent's own cell first, the
+    others' after it in the order of the agents, and at the end a 1 at the agent's place among N
+    numbers: agents that stand on one cell, as all do at the start, can still act differently.
+    """
+    if spec.team != "shared":
+        return observations
+    n = spec.n_agents
+    whose = np.zeros((*observations.shape[:-1], n), observations.dtype)
+    whose[..., agent] = 1
+    cells = np.roll(observations[..., :n], -agent, axis=-1)
+    return np.concatenate((cells, observations[..., n:], whose), axis=-1)
+
+
+Network = PaperNetwork | PairsNetwork | Team
 
 
 def linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
@@ -237,7 +323,8 @@ def bag(n_in: int, n_out: int, std: float, generator: torch.Generator | None) ->
 
 def build_network(spec: NetworkSpec, generator: torch.Generator | None = None) -> Network:
     """Build the network a spec describes; start values come from `generator`."""
-    return NETWORKS[spec.kind](spec, generator or torch.Generator())
+    kind = NETWORKS[spec.kind] if spec.team == "one" else Team
+    return kind(spec, generator or torch.Generator())
 
 
 def greedy_actions(values: Tensor, spec: NetworkSpec) -> np.ndarray:

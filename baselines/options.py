@@ -2,9 +2,10 @@
 
 import dataclasses
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 import tyro
 
@@ -17,6 +18,9 @@ REWARDS = ("manhattan", "geodesic", "step")
 @dataclass(frozen=True)
 class Options:
     """Options of a training; the defaults shown are the preset's."""
+
+    OUTPUTS: ClassVar[tuple[str, ...]] = ("joint", "agents")
+    REPLAYS: ClassVar[tuple[str, ...]] = ("imagined", "stored")
 
     preset: Literal["default", "paper"] = "default"
     """where the other options start from; "paper": section 5 of the paper, and for what it leaves
@@ -141,8 +145,8 @@ class Options:
         check_choice("reward", self.reward, REWARDS)
         check_choice("final_reward", self.final_reward, (*REWARDS, "same"))
         check_choice("network", self.network, ("pairs", "paper"))
-        check_choice("outputs", self.outputs, ("joint", "agents"))
-        check_choice("replay", self.replay, ("imagined", "stored"))
+        check_choice("outputs", self.outputs, self.OUTPUTS)
+        check_choice("replay", self.replay, self.REPLAYS)
         for name in ("dueling", "double", "learning_rate_falls", "prefetch"):
             check_flag(name, getattr(self, name))
         for name, low, high in COUNTS:
@@ -234,16 +238,29 @@ def preset_options(kind: type[Chosen], preset: str, **changes: Any) -> Chosen:
     return kind(**{"preset": preset, **PRESETS[preset], **changes})
 
 
-def parse_options(kind: type[Chosen], description: str) -> Chosen:
-    """Read the options from the command line: a preset's, where nothing else is said."""
+def parse_options(
+    kind: type[Chosen], description: str, words: Sequence[str] | None = None
+) -> Chosen:
+    """Read the options from a command line: a preset's, where nothing else is said.
+
+    Parameters
+    ----------
+    kind
+        Of the options.
+    description
+        Shown with the help.
+    words
+        The command line, by default that of this process.
+    """
+    words = sys.argv[1:] if words is None else words
     preset = "default"
-    for index, word in enumerate(sys.argv[1:], start=1):
+    for index, word in enumerate(words, start=1):
         if word.startswith("--preset="):
             preset = word.partition("=")[2]
-        elif word == "--preset" and index + 1 < len(sys.argv):
-            preset = sys.argv[index + 1]
+        elif word == "--preset" and index < len(words):
+            preset = words[index]
     start = preset_options(kind, preset if preset in PRESETS else "default")
-    return tyro.cli(kind, default=start, description=description)
+    return tyro.cli(kind, args=words, default=start, description=description)
 
 
 def check_resumed(options: Options) -> None:

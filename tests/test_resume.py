@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import checkpoints, experiment, meta_dqn, runs
+from baselines import checkpoints, experiment, independent_dqn, meta_dqn, runs
 from baselines.checkpoints import Checkpoints
 from baselines.meta_dqn import Args, MetaLearner
-from baselines.options import preset_options
+from baselines.options import Options, preset_options
 
 SHORT = {
     "n_problems": 2,
@@ -29,17 +29,24 @@ PRESETS = {
     "default": {"updates_per_episode": 6, "max_cycles": 20},
     "paper": {"memory_size": 40, "max_cycles": 20, "update_interval": 3},
     "double": {"updates_per_episode": 6, "max_cycles": 20, "double": True, "dueling": True},
+    "independent": {"updates_per_episode": 4, "max_cycles": 20},
+    "independent-paper": {"memory_size": 40, "max_cycles": 20, "update_interval": 5},
+    "shared": {"updates_per_episode": 6, "max_cycles": 20, "share_parameters": True},
 }
 
 
-def options(kind: str, **changes: object) -> Args:
+def options(kind: str, **changes: object) -> Options:
     """Return the options of a short training."""
-    preset = "paper" if kind == "paper" else "default"
-    return preset_options(Args, preset, **{**SHORT, **PRESETS[kind], **changes})
+    preset = "paper" if kind.endswith("paper") else "default"
+    meta = kind in ("default", "paper", "double")
+    chosen = Args if meta else independent_dqn.Args
+    return preset_options(chosen, preset, **{**SHORT, **PRESETS[kind], **changes})
 
 
-def run(args: Args) -> int:
+def run(args: Options) -> int:
     """Train in this process, without the table and the figures."""
+    if isinstance(args, independent_dqn.Args):
+        return independent_dqn.main(args)
     return experiment.run_experiment(args, meta_dqn.ALGORITHM, MetaLearner)
 
 
@@ -83,7 +90,7 @@ class Killer:
         )
 
 
-def run_and_die(args: Args, moment: int) -> int:
+def run_and_die(args: Options, moment: int) -> int:
     """Train in a forked process that is killed at a moment; return its exit status."""
     child = os.fork()
     if child == 0:
@@ -113,7 +120,13 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("kind", "kills"), [("default", 34), ("paper", 8), ("double", 8)])
+KINDS = [
+    *(("default", 34), ("paper", 8), ("double", 8)),
+    *(("independent", 8), ("independent-paper", 6), ("shared", 6)),
+]
+
+
+@pytest.mark.parametrize(("kind", "kills"), KINDS)
 def test_killed_at_any_moment_and_resumed(kind, kills, tmp_path, monkeypatch):
     """Killed (SIGKILL) again and again, a third of the times within a save: the same bytes."""
     whole = options(kind, out=tmp_path / "whole")
@@ -134,17 +147,18 @@ def test_killed_at_any_moment_and_resumed(kind, kills, tmp_path, monkeypatch):
         assert run_and_die(options(kind, out=folder), moment) == -signal.SIGKILL
         if index % 4 == 0 and (folder / "config.json").exists():
             # Killed once more after the resumption, in whatever it does then.
-            run_and_die(Args(resume=folder), int(rng.integers(40)))
+            run_and_die(type(whole)(resume=folder), int(rng.integers(40)))
         if not (folder / "config.json").exists():
             continue  # killed before there was a run
-        assert run(Args(resume=folder)) == 0
+        assert run(type(whole)(resume=folder)) == 0
         assert results(folder) == expected
 
 
-def test_without_a_second_thread_the_same(tmp_path):
+@pytest.mark.parametrize("kind", ["default", "independent"])
+def test_without_a_second_thread_the_same(kind, tmp_path):
     """Preparing batches ahead in a second thread changes no byte."""
-    run(options("default", out=tmp_path / "one"))
-    run(options("default", out=tmp_path / "two", prefetch=True))
+    run(options(kind, out=tmp_path / "one"))
+    run(options(kind, out=tmp_path / "two", prefetch=True))
     assert results(tmp_path / "one") == results(tmp_path / "two")
 
 

@@ -1,0 +1,435 @@
+"""Each agent has a network of its own: independent learners, trained by deep Q-learning.
+
+Method: independent Q-learning (Tan 1993) with DQN (Mnih et al. 2015). Every learner has its own
+network, target network, optimiser, memory and random numbers, tosses its own coin to explore, sees
+the global observation and gets the team reward. It has values of its own four actions only and is
+never told what the others did: they are a part of its environment, one that changes while they
+learn. With ``--share-parameters`` one network learns from all agents' transitions and each agent
+uses it by itself: it is given the agent's own cell first, and whose turn it is. Two presets, each
+as close to the meta-agent's as an agent by itself can come:
+
+- ``default``: a network that sees cells as categories and landmarks as a set, with agents in a
+  fixed order, and replay of the agent's own transitions with fresh landmarks. What the meta-agent
+  has besides, recombined moves of several agents and two joint actions compared in one state,
+  takes commands over all agents and is left out;
+- ``paper``: a network on the plain numbers, replay of what was played, and the decaying guidance
+  that points agents to close landmarks while training.
+
+Fairness: the same episodes, and for every network as many updates, of as many states, as the
+meta-agent's one network gets. In the default preset an update costs a bit more than half of the
+meta-agent's, which compares two joint actions in each state, so three learners take somewhat less
+than twice its time, and learners that share their parameters about half of it.
+
+Paper: M. Cetinkaya, Multi-Agent Path Planning Using Deep Reinforcement Learning, section 4$
+(arXiv 2110.01460), which leaves open how independent learners would do.
+
+Command::
+
+    python baselines/independent_dqn.py --seed 0
+    python baselines/independent_dqn.py --preset paper --share-parameters
+    python baselines/independent_dqn.py --resume runs/independent_dqn-default-seed0-...
+
+Output: a run folder as of meta_dqn.py; policy.safetensors holds the networks of all agents.
+"""
+
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from baselines.checks import check_flag, check_number
+from baselines.experiment import N_ACTIONS, Streams, run_experiment
+from baselines.meta_dqn import Goal, next_values, relabelled_reward, td_targets
+from baselines.networks import (
+    Network,
+    NetworkSpec,
+    Team,
+    build_network,
+    greedy_actions,
+    torch_generator,
+    view,
+)
+from baselines.optimiser import optimiser_arrays, restore_optimiser
+from baselines.options import Options, parse_options
+from baselines.policy import NetworkPolicy
+from baselines.relabelled_replay import RelabelledReplay
+from baselines.replay_memory import Batch, ReplayMemory
+from mapp_env import Grid
+
+ALGORITHM = "independent_dqn"
+
+
+# -- configuration -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Args(Options):
+    """Options of independent learners; those of imagined replay and joint values have no effect."""
+
+    OUTPUTS: ClassVar[tuple[str, ...]] = ("agents",)
+    REPLAYS: ClassVar[tuple[str, ...]] = ("relabelled", "stored")
+
+    network: Literal["pairs", "paper"] = "pairs"
+    """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
+    landmarks as a set, agents in a fixed order (baselines/networks.py)"""
+    outputs: Literal["agents"] = "agents"
+    """a value for each action of the agent itself"""
+    replay: Literal["relabelled", "stored"] = "relabelled"
+    """"stored": transitions as they were played; "relabelled": the agent's own transitions, most of
+    them with fresh landmarks (baselines/relabelled_replay.py)"""
+
+    share_parameters: bool = False
+    """whether all agents use one network, which learns from all of them"""
+    fresh_landmarks: float = 0.9
+    """share of the relabelled transitions that get fresh landmarks; the others keep their own"""
+    fresh_as_far: float = 0.9
+    """share of those with as many landmarks visited as were; the others with any number"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_flag("share_parameters", self.share_parameters)
+        check_number("fresh_landmarks", self.fresh_landmarks, 0.0, 1.0)
+        check_number("fresh_as_far", self.fresh_as_far, 0.0, 1.0)
+
+
+# -- network -----------------------------------------------------------------------------------
+
+
+def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Team:
+    """Build the networks of all agents."""
+    spec = NetworkSpec(
+        kind=args.network,
+        n_agents=args.n_agents,
+        n_landmarks=args.n_landmarks,
+        n_actions=N_ACTIONS,
+        n_cells=grid.n_cells,
+        hidden_units=args.hidden_units,
+        outputs=args.outputs,
+        dueling=args.dueling,
+        code_units=args.code_units,
+        landmark_units=args.landmark_units,
+        team="shared" if args.share_parameters else "independent",
+    )
+    team = build_network(spec, generator)
+    assert isinstance(team, Team)
+    return team
+
+
+# -- loss --------------------------------------------------------------------------------------
+
+
+def chosen_values(values: Tensor, actions: Tensor) -> Tensor:
+    """Return the values (B, T) of the agent's own actions taken.
+
+    Parameters
+    ----------
+    values
+        (B, 1, A).
+    actions
+        (B, T, 1).
+    """
+    return values[:, 0].gather(1, actions[:, :, 0])
+
+
+# -- learner -----------------------------------------------------------------------------------
+
+
+class AgentLearner:
+    """One network, its target network, optimiser and replay.
+
+    Parameters
+    ----------
+    args
+        Options.
+    grid
+        The grid.
+    network, target
+        One agent's networks.
+    n_sources
+        Agents whose transitions it learns from: itself, or all that share the network.
+    seeds
+        Of its own random numbers.
+    """
+
+    def __init__(
+        self,
+        args: Args,
+        grid: Grid,
+        network: Network,
+        target: Network,
+        n_sources: int,
+        seeds: np.random.SeedSequence,
+    ) -> None:
+        self.args = args
+        self.network, self.target = network, target
+        self.target.load_state_dict(self.network.state_dict())
+        self.spec = self.network.spec
+        self.weights = list(self.network.parameters())
+        self.target_weights = list(self.target.parameters())
+        # The fused step on a CPU is what needs torch 2.4.
+        self.optimiser = torch.optim.Adam(self.weights, lr=args.learning_rate, fused=True)
+        self.rng = np.random.default_rng(seeds)
+        self.updates = 0
+        self.prepared: tuple[Batch, Tensor] | None = None  # the next batch and its targets
+        # Stored transitions are drawn when they are needed, and double DQN needs the network as it
+        # is then; all else can be prepared ahead.
+        self.ahead = args.replay == "relabelled" and not args.double
+        self.helper = ThreadPoolExecutor(1) if self.ahead and args.prefetch else None
+        self.memory: ReplayMemory | None = None
+        self.relabelled: RelabelledReplay | None = None
+        final = args.reward if args.final_reward == "same" else args.final_reward
+        self.goals = (
+            Goal(relabelled_reward(grid, args.reward, args.reward_scale), args.discount),
+            Goal(relabelled_reward(grid, final, args.final_reward_scale), args.final_discount),
+        )
+        # Of each agent, as many transitions as are kept of it when it learns alone.
+        capacity = n_sources * args.memory_size
+        if args.replay == "stored":
+            self.memory = ReplayMemory(capacity, self.spec.n_inputs, 1)
+        else:
+            self.relabelled = RelabelledReplay(
+                self.spec, grid.depot, capacity, args.fresh_landmarks, args.fresh_as_far
+            )
+
+    # -- learning
+
+    def remember(
+        self,
+        observation: np.ndarray,
+        action: int,
+        reward: float,
+        next_observation: np.ndarray,
+        terminated: bool,
+    ) -> None:
+        """Take note of an agent's transition: its own action, nobody else's."""
+        if self.memory is not None:
+            self.memory.add(observation, np.array([action]), reward, next_observation, terminated)
+        if self.relabelled is not None:
+            self.relabelled.remember(observation, action, next_observation)
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to learn from."""
+        return self.relabelled.ready if self.relabelled is not None else True
+
+    def update(self, progress: float) -> float:
+        """One step of Adam on the Huber loss of a batch; return the loss.
+
+        Parameters
+        ----------
+        progress
+            Part of the training that is over, 0 to 1.
+        """
+        args = self.args
+        batch, targets = self.prepared or self.prepare(progress)
+        if self.helper is not None:
+            # Beside the step below: it reads the target network only, which does not change before
+            # the step is done. So the weights are the same as without a helper.
+            coming = self.helper.submit(self.prepare, progress)
+            loss = self.fit(batch, targets, progress)
+            self.prepared = coming.result()
+        else:
+            if self.ahead:
+                self.prepared = self.prepare(progress)
+            loss = self.fit(batch, targets, progress)
+        self.updates += 1
+        if args.target_interval:
+            if self.updates % args.target_interval == 0:
+                self.target.load_state_dict(self.network.state_dict())
+        else:
+            with torch.no_grad():
+                torch._foreach_lerp_(self.target_weights, self.weights, args.target_rate)
+        return loss
+
+    def prepare(self, progress: float) -> tuple[Batch, Tensor]:
+        """Return a batch and the targets of its values."""
+        args = self.args
+        late = args.final_reward != "same" and progress >= args.final_from
+        goal = self.goals[late and args.replay == "relabelled"]
+        with torch.no_grad():
+            if self.memory is not None:
+                batch, scale = self.memory.sample(args.batch_size, self.rng), args.reward_scale
+            else:
+                assert self.relabelled is not None
+                batch = self.relabelled.draw(args.batch_size, goal.reward, self.rng)
+                scale = 1.0  # already in the reward
+            seen = torch.from_numpy(batch.next_observations[:, 0])
+            values = self.target(seen)[:, 0]
+            chooser = self.network(seen)[:, 0] if args.double else values
+            following = next_values(values, chooser, None)
+            if self.relabelled is not None:
+                # No reward of the rules is above 0, so no value is. Without this bound the values
+                # of a learner can feed on themselves and grow past all measure: where it has not
+                # been with the others, nothing it experienced contradicts them.
+                following = following.clamp(max=0.0)
+            targets = td_targets(
+                scale * torch.from_numpy(batch.rewards[:, 0]),
+                torch.from_numpy(batch.terminated[:, 0]),
+                following,
+                goal.discount,
+            )
+        return batch, targets.view(*batch.rewards.shape)
+
+    def fit(self, batch: Batch, targets: Tensor, progress: float) -> float:
+        """Step towards the targets; return the loss."""
+        args = self.args
+        rate = args.learning_rate * (1.0 - progress if args.learning_rate_falls else 1.0)
+        if args.learning_rate_warmup:
+            rate *= min(1.0, (self.updates + 1) / args.learning_rate_warmup)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        values = self.network(torch.from_numpy(batch.observations))
+        chosen = chosen_values(values, torch.from_numpy(batch.actions))
+        loss = nn.functional.smooth_l1_loss(chosen, targets, beta=args.huber)
+        self.optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        return loss.item()
+
+    # -- checkpoints
+
+    @property
+    def replay(self) -> ReplayMemory | RelabelledReplay:
+        """What is learned from."""
+        if self.memory is not None:
+            return self.memory
+        assert self.relabelled is not None
+        return self.relabelled
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        parts: dict[str, dict[str, np.ndarray]] = {
+            "network": {name: t.numpy() for name, t in self.network.state_dict().items()},
+            "target": {name: t.numpy() for name, t in self.target.state_dict().items()},
+            "optimiser": optimiser_arrays(self.optimiser),
+            "replay": self.replay.arrays_by_name(),
+        }
+        if self.prepared is not None:
+            batch, targets = self.prepared
+            parts["prepared"] = {**batch._asdict(), "targets": targets.numpy()}
+        return {
+            f"{part}.{name}": array
+            for part, arrays in parts.items()
+            for name, array in arrays.items()
+        }
+
+    def state(self) -> dict[str, Any]:
+        """Return all else that changes, ready for JSON."""
+        return {"updates": self.updates, "rng": self.rng.bit_generator.state}
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what :meth:`arrays` and :meth:`state` returned."""
+        for name, network in (("network", self.network), ("target", self.target)):
+            weights = part(arrays, name)
+            network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
+        restore_optimiser(self.optimiser, part(arrays, "optimiser"))
+        self.replay.restore(part(arrays, "replay"))
+        prepared = part(arrays, "prepared")
+        if prepared:
+            targets = torch.from_numpy(prepared.pop("targets"))
+            self.prepared = Batch(**prepared), targets
+        self.updates = state["updates"]
+        self.rng.bit_generator.state = state["rng"]
+
+
+class IndependentLearners:
+    """The learners of all agents, side by side; or one, if they share their parameters."""
+
+    def __init__(self, args: Args, grid: Grid, streams: Streams) -> None:
+        self.network = make_network(args, grid, torch_generator(streams.network))
+        self.spec = self.network.spec
+        targets = make_network(args, grid, torch.Generator()).members
+        n_learners = len(self.network.members)
+        self.learners = [
+            AgentLearner(args, grid, network, target, args.n_agents // n_learners, seeds)
+            for network, target, seeds in zip(
+                self.network.members, targets, streams.replay.spawn(n_learners), strict=True
+            )
+        ]
+
+    # -- acting
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return each agent's own greedy action (N,)."""
+        with torch.inference_mode():
+            return greedy_actions(self.network(torch.from_numpy(observation[None])), self.spec)[0]
+
+    def policy(self) -> NetworkPolicy:
+        """Return what was learned."""
+        return NetworkPolicy(self.network)
+
+    # -- learning
+
+    def remember(
+        self,
+        observation: np.ndarray,
+        actions: np.ndarray,
+        reward: float,
+        next_observation: np.ndarray,
+        terminated: bool,
+    ) -> None:
+        """Hand every agent's learner what that agent saw, did and got."""
+        for agent, action in enumerate(actions.tolist()):
+            self.learners[agent % len(self.learners)].remember(
+                view(observation, agent, self.spec),
+                action,
+                reward,
+                view(next_observation, agent, self.spec),
+                terminated,
+            )
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to learn from."""
+        return all(learner.ready for learner in self.learners)
+
+    def update(self, progress: float) -> float:
+        """One update of every learner; return their mean loss."""
+        return sum(learner.update(progress) for learner in self.learners) / len(self.learners)
+
+    @property
+    def updates(self) -> int:
+        """Updates of each learner."""
+        return self.learners[0].updates
+
+    # -- checkpoints
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        return {
+            f"{index}.{name}": array
+            for index, learner in enumerate(self.learners)
+            for name, array in learner.arrays().items()
+        }
+
+    def state(self) -> dict[str, Any]:
+        """Return all else that changes, ready for JSON."""
+        return {"learners": [learner.state() for learner in self.learners]}
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what :meth:`arrays` and :meth:`state` returned."""
+        states = state["learners"]
+        for index, (learner, own) in enumerate(zip(self.learners, states, strict=True)):
+            learner.restore(part(arrays, str(index)), own)
+
+
+def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """Return the arrays whose names begin with a name and a dot, without these."""
+    start = name + "."
+    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+
+
+def main(args: Args) -> int:
+    """Train, evaluate, draw; return the exit code."""
+    return run_experiment(args, ALGORITHM, IndependentLearners)
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main(parse_options(Args, __doc__ or "")))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from error
