@@ -67,8 +67,16 @@ class Args(solving.Args):
 def make_learner(
     args: Args, policy: NetworkPolicy, setting: Setting, problem: Problem
 ) -> MetaLearner:
-    """Return a learner that goes on from a policy, on one problem alone."""
+    """Return a learner that goes on from a policy, on one problem alone.
+
+    Raises
+    ------
+    ValueError
+        If the policy is no meta-agent's: independent learners have no joint actions to try.
+    """
     spec = policy.spec
+    if spec.team != "one":
+        raise ValueError(f"policy must be a meta-agent's, got one of {spec.team} learners")
     training = preset_options(
         TrainingArgs,
         "default",
