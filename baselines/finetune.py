@@ -29,12 +29,12 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 from baselines import solve as solving
 from baselines.checks import check_count, check_number
 from baselines.evaluation import count_unseen, evaluate, find_optima, unseen_problems
-from baselines.experiment import Streams
 from baselines.meta_dqn import Args as TrainingArgs
 from baselines.meta_dqn import MetaLearner
 from baselines.options import preset_options
 from baselines.policy import NetworkPolicy, find_weights
 from baselines.settings import N_ACTIONS, Setting, read_setting
+from baselines.training import Streams
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 
 

@@ -20,6 +20,7 @@ from numba import njit  # type: ignore[import-untyped]
 
 from baselines.networks import NetworkSpec, split_joint
 from baselines.replay_memory import Batch
+from mapp_env import Grid
 
 UNKNOWN = -1
 
@@ -29,6 +30,17 @@ class RelabelledReward(NamedTuple):
 
     distances: np.ndarray  # (C, C) float32 from a cell to a landmark, or (0, 0): -1 a step
     scale: float  # what it is multiplied by, to keep values of the order of one
+
+
+def relabelled_reward(grid: Grid, reward: str, scale: float) -> RelabelledReward:
+    """Return what the rules give for any landmarks."""
+    if reward == "step":
+        return RelabelledReward(np.zeros((0, 0), np.float32), scale)
+    if reward == "geodesic":
+        return RelabelledReward(np.asarray(grid.distances, np.float32), scale)
+    rows, cols = np.divmod(np.arange(grid.n_cells), grid.cols)
+    steps = abs(rows[:, None] - rows) + abs(cols[:, None] - cols)
+    return RelabelledReward(steps.astype(np.float32), scale)
 
 
 class ImaginedReplay:

@@ -33,17 +33,15 @@ Output: a run folder as of meta_dqn.py; policy.safetensors holds the networks of
 """
 
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from baselines.checks import check_flag, check_number
-from baselines.experiment import N_ACTIONS, Streams, run_experiment
-from baselines.meta_dqn import Goal, next_values, relabelled_reward, td_targets
+from baselines.experiment import run_experiment
 from baselines.networks import (
     Network,
     NetworkSpec,
@@ -53,11 +51,13 @@ from baselines.networks import (
     torch_generator,
     view,
 )
-from baselines.optimiser import optimiser_arrays, restore_optimiser
 from baselines.options import Options, parse_options
 from baselines.policy import NetworkPolicy
+from baselines.q_learner import QLearner, next_values, part, td_targets
 from baselines.relabelled_replay import RelabelledReplay
 from baselines.replay_memory import Batch, ReplayMemory
+from baselines.settings import N_ACTIONS
+from baselines.training import Streams
 from mapp_env import Grid
 
 ALGORITHM = "independent_dqn"
@@ -138,7 +138,7 @@ def chosen_values(values: Tensor, actions: Tensor) -> Tensor:
 # -- learner -----------------------------------------------------------------------------------
 
 
-class AgentLearner:
+class AgentLearner(QLearner):
     """One network, its target network, optimiser and replay.
 
     Parameters
@@ -164,28 +164,9 @@ class AgentLearner:
         n_sources: int,
         seeds: np.random.SeedSequence,
     ) -> None:
-        self.args = args
-        self.network, self.target = network, target
-        self.target.load_state_dict(self.network.state_dict())
-        self.spec = self.network.spec
-        self.weights = list(self.network.parameters())
-        self.target_weights = list(self.target.parameters())
-        # The fused step on a CPU is what needs torch 2.4.
-        self.optimiser = torch.optim.Adam(self.weights, lr=args.learning_rate, fused=True)
-        self.rng = np.random.default_rng(seeds)
-        self.updates = 0
-        self.prepared: tuple[Batch, Tensor] | None = None  # the next batch and its targets
-        # Stored transitions are drawn when they are needed, and double DQN needs the network as it
-        # is then; all else can be prepared ahead.
-        self.ahead = args.replay == "relabelled" and not args.double
-        self.helper = ThreadPoolExecutor(1) if self.ahead and args.prefetch else None
+        super().__init__(args, grid, network, target, np.random.default_rng(seeds))
         self.memory: ReplayMemory | None = None
         self.relabelled: RelabelledReplay | None = None
-        final = args.reward if args.final_reward == "same" else args.final_reward
-        self.goals = (
-            Goal(relabelled_reward(grid, args.reward, args.reward_scale), args.discount),
-            Goal(relabelled_reward(grid, final, args.final_reward_scale), args.final_discount),
-        )
         # Of each agent, as many transitions as are kept of it when it learns alone.
         capacity = n_sources * args.memory_size
         if args.replay == "stored":
@@ -216,40 +197,18 @@ class AgentLearner:
         """Whether there is something to learn from."""
         return self.relabelled.ready if self.relabelled is not None else True
 
-    def update(self, progress: float) -> float:
-        """One step of Adam on the Huber loss of a batch; return the loss.
-
-        Parameters
-        ----------
-        progress
-            Part of the training that is over, 0 to 1.
-        """
-        args = self.args
-        batch, targets = self.prepared or self.prepare(progress)
-        if self.helper is not None:
-            # Beside the step below: it reads the target network only, which does not change before
-            # the step is done. So the weights are the same as without a helper.
-            coming = self.helper.submit(self.prepare, progress)
-            loss = self.fit(batch, targets, progress)
-            self.prepared = coming.result()
-        else:
-            if self.ahead:
-                self.prepared = self.prepare(progress)
-            loss = self.fit(batch, targets, progress)
-        self.updates += 1
-        if args.target_interval:
-            if self.updates % args.target_interval == 0:
-                self.target.load_state_dict(self.network.state_dict())
-        else:
-            with torch.no_grad():
-                torch._foreach_lerp_(self.target_weights, self.weights, args.target_rate)
-        return loss
+    @property
+    def replay(self) -> ReplayMemory | RelabelledReplay:
+        """What is learned from."""
+        if self.memory is not None:
+            return self.memory
+        assert self.relabelled is not None
+        return self.relabelled
 
     def prepare(self, progress: float) -> tuple[Batch, Tensor]:
         """Return a batch and the targets of its values."""
         args = self.args
-        late = args.final_reward != "same" and progress >= args.final_from
-        goal = self.goals[late and args.replay == "relabelled"]
+        goal = self.goal(progress)
         with torch.no_grad():
             if self.memory is not None:
                 batch, scale = self.memory.sample(args.batch_size, self.rng), args.reward_scale
@@ -274,66 +233,9 @@ class AgentLearner:
             )
         return batch, targets.view(*batch.rewards.shape)
 
-    def fit(self, batch: Batch, targets: Tensor, progress: float) -> float:
-        """Step towards the targets; return the loss."""
-        args = self.args
-        rate = args.learning_rate * (1.0 - progress if args.learning_rate_falls else 1.0)
-        if args.learning_rate_warmup:
-            rate *= min(1.0, (self.updates + 1) / args.learning_rate_warmup)
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        values = self.network(torch.from_numpy(batch.observations))
-        chosen = chosen_values(values, torch.from_numpy(batch.actions))
-        loss = nn.functional.smooth_l1_loss(chosen, targets, beta=args.huber)
-        self.optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        self.optimiser.step()
-        return loss.item()
-
-    # -- checkpoints
-
-    @property
-    def replay(self) -> ReplayMemory | RelabelledReplay:
-        """What is learned from."""
-        if self.memory is not None:
-            return self.memory
-        assert self.relabelled is not None
-        return self.relabelled
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays that change, by name."""
-        parts: dict[str, dict[str, np.ndarray]] = {
-            "network": {name: t.numpy() for name, t in self.network.state_dict().items()},
-            "target": {name: t.numpy() for name, t in self.target.state_dict().items()},
-            "optimiser": optimiser_arrays(self.optimiser),
-            "replay": self.replay.arrays_by_name(),
-        }
-        if self.prepared is not None:
-            batch, targets = self.prepared
-            parts["prepared"] = {**batch._asdict(), "targets": targets.numpy()}
-        return {
-            f"{part}.{name}": array
-            for part, arrays in parts.items()
-            for name, array in arrays.items()
-        }
-
-    def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
-        return {"updates": self.updates, "rng": self.rng.bit_generator.state}
-
-    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what :meth:`arrays` and :meth:`state` returned."""
-        for name, network in (("network", self.network), ("target", self.target)):
-            weights = part(arrays, name)
-            network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
-        restore_optimiser(self.optimiser, part(arrays, "optimiser"))
-        self.replay.restore(part(arrays, "replay"))
-        prepared = part(arrays, "prepared")
-        if prepared:
-            targets = torch.from_numpy(prepared.pop("targets"))
-            self.prepared = Batch(**prepared), targets
-        self.updates = state["updates"]
-        self.rng.bit_generator.state = state["rng"]
+    def chosen(self, values: Tensor, actions: Tensor) -> Tensor:
+        """Return the values of the agent's own actions taken."""
+        return chosen_values(values, actions)
 
 
 class IndependentLearners:
@@ -415,12 +317,6 @@ class IndependentLearners:
         states = state["learners"]
         for index, (learner, own) in enumerate(zip(self.learners, states, strict=True)):
             learner.restore(part(arrays, str(index)), own)
-
-
-def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a name and a dot, without these."""
-    start = name + "."
-    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
 
 
 def main(args: Args) -> int:

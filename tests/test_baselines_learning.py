@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import meta_dqn
-from baselines.experiment import Streams, Training
+from baselines import meta_dqn, q_learner
 from baselines.guidance import Guidance, GuidedPolicy, LinearSchedule
 from baselines.meta_dqn import Args, MetaLearner
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.options import preset_options
 from baselines.replay_memory import Batch, ReplayMemory
+from baselines.training import Streams, Training
 from mapp_env import Grid, make_grid
 
 LEFT, RIGHT, UP, DOWN = range(4)
@@ -42,8 +42,8 @@ def test_targets_equal_hand_computed_ones():
     rewards = torch.tensor([-7.0, 0.0, -2.0])
     # A time-out is stored as "not terminated", like a step in the middle of an episode.
     terminated = torch.tensor([False, True, False])
-    best = meta_dqn.next_values(next_scores, next_scores, None)
-    targets = meta_dqn.td_targets(rewards, terminated, best, 0.95)
+    best = q_learner.next_values(next_scores, next_scores, None)
+    targets = q_learner.td_targets(rewards, terminated, best, 0.95)
     expected = [[-7 + 0.95 * 4, -7 - 0.95], [0, 0], [-2 + 0.95 * 4, -2 - 0.95]]
     np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
 

@@ -5,8 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from baselines.imagined_replay import UNKNOWN, ImaginedReplay, try_actions
-from baselines.meta_dqn import relabelled_reward
+from baselines.imagined_replay import UNKNOWN, ImaginedReplay, relabelled_reward, try_actions
 from baselines.networks import NetworkSpec, split_joint
 from mapp_env import Grid, make_grid
 from mapp_env.dynamics import (

@@ -7,14 +7,13 @@ import pytest
 import safetensors.torch
 import torch
 
-from baselines.experiment import Streams
-from baselines.imagined_replay import RelabelledReward
+from baselines.imagined_replay import RelabelledReward, relabelled_reward
 from baselines.independent_dqn import Args, IndependentLearners
-from baselines.meta_dqn import relabelled_reward
 from baselines.networks import NetworkSpec, Team, build_network, torch_generator, view
 from baselines.options import preset_options
 from baselines.policy import WEIGHTS_KEY, load_policy, save_policy
 from baselines.relabelled_replay import RelabelledReplay
+from baselines.training import Streams
 from mapp_env import make_grid
 
 LEFT, RIGHT, UP, DOWN = range(4)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.experiment import Streams, Training
 from baselines.meta_dqn import (
     Args,
     MetaLearner,
@@ -19,6 +18,7 @@ from baselines.meta_dqn import (
 )
 from baselines.networks import NetworkSpec
 from baselines.options import preset_options
+from baselines.training import Streams, Training
 from mapp_env import Grid
 from mapp_env.dynamics import BY_COORDINATES, NO_DISTANCES, Reward, cell_table, step_row
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from baselines.evaluation import Setting, count_unseen, evaluate, find_optima, unseen_problems
-from baselines.experiment import Streams, Training
 from baselines.meta_dqn import Args, MetaLearner
+from baselines.training import Streams, Training
 from mapp_env import Grid, sample_problems
 
 SOLVED = 100.0  # per cent of the unseen problems
