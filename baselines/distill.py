@@ -2,8 +2,9 @@
 
 Method: imitation of all optimal joint actions at once. In each state of episodes that the network
 itself plays (as in DAgger, Ross et al. 2011) the exact solver says which joint actions are optimal,
-and the loss is minus the logarithm of the probability that the network gives to them together. This
-is not reinforcement learning, and policies made by it are called distilled.
+and the loss is minus the logarithm of the probability that the network gives to them together.
+States that it answers wrongly are asked again until it answers them rightly. This is not
+reinforcement learning, and policies made by it are called distilled.
 
 Paper: section 6, last paragraph (arXiv 2110.01460): learning combined with optimisation.
 
@@ -35,12 +36,14 @@ from baselines.imagined_replay import ImaginedReplay
 from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
 from baselines.optimiser import optimiser_arrays, restore_optimiser
 from baselines.policy import NetworkPolicy, save_policy
+from baselines.q_learner import part
 from baselines.runs import WEIGHTS_FILE, RunFolder, StopSignals, default_folder, read_config
 from baselines.settings import N_ACTIONS, Setting, find_grid
 from mapp_env import Grid
 
 ALGORITHM = "distill"
 METRICS = ("updates", "loss")
+MAX_MISTAKES = 4096  # states that are waiting to be asked again; the oldest is forgotten
 LOGGED = 100  # updates in a row of metrics.csv
 MAX_CELLS = 4096  # of whose distances there is a table
 
@@ -79,6 +82,8 @@ class Args:
     """steps of Adam"""
     batch_size: int = 512
     """states in an update"""
+    asked_again: int = 128
+    """at most so many states in an update besides, those that were answered wrongly before"""
     learning_rate: float = 0.003
     """step size of Adam; it falls in a straight line to 0"""
     exploration: float = 0.1
@@ -101,6 +106,7 @@ class Args:
         check_count("max_cycles", self.max_cycles, 1, 1_000_000)
         check_count("updates", self.updates, 1, 1_000_000_000)
         check_count("batch_size", self.batch_size, 1, 65_536)
+        check_count("asked_again", self.asked_again, 0, 65_536)
         check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
         check_number("exploration", self.exploration, 0.0, 1.0)
         check_number("from_depot", self.from_depot, 0.0, 1.0)
@@ -161,17 +167,20 @@ class Pupil:
         reached = np.append(grid.reachable, grid.depot)
         self.states.moves[reached] = np.asarray(grid.moves)[reached, :N_ACTIONS]
         self.distances = np.asarray(grid.distances, np.int64)
+        self.mistakes = np.zeros((0, self.spec.observation_size), np.float32)  # the oldest first
         self.updates = 0
         self.losses: list[float] = []  # since the last row of metrics.csv
 
     def update(self) -> float:
         """Learn from one batch of states, go on to the next; return the loss."""
-        args, states = self.args, self.states
+        args, states, n = self.args, self.states, self.spec.n_agents
         states.start_over(self.rng)
-        steps = steps_left(
-            states.cells, states.landmarks, states.visited, states.moves, self.distances
-        )
-        scores = self.network(torch.from_numpy(states.observations()))
+        again = self.mistakes[: args.asked_again]
+        seen = np.concatenate((states.observations(), again))
+        whole = seen.astype(np.int64)
+        cells, landmarks, flags = np.split(whole, (n, n + self.spec.n_landmarks), axis=1)
+        steps = steps_left(cells, landmarks, flags > 0, states.moves, self.distances)
+        scores = self.network(torch.from_numpy(seen))
         loss = optimal_actions_loss(scores, steps)
         rate = args.learning_rate * (1 - self.updates / args.updates)
         for group in self.optimiser.param_groups:
@@ -180,10 +189,13 @@ class Pupil:
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
         joint = scores.argmax(1).numpy()
-        n_rows, n_joint = scores.shape
+        wrong = steps[np.arange(len(seen)), joint] > steps.min(axis=1)
+        left = np.concatenate((self.mistakes[len(again) :], seen[wrong]))
+        self.mistakes = left[-MAX_MISTAKES:] if args.asked_again else left[:0]
+        n_rows, n_joint = len(states.cells), scores.shape[1]
         explores = self.rng.random(n_rows) < args.exploration
-        joint = np.where(explores, self.rng.integers(n_joint, size=n_rows), joint)
-        states.follow(split_joint(joint, self.spec.n_agents, self.spec.n_actions))
+        joint = np.where(explores, self.rng.integers(n_joint, size=n_rows), joint[:n_rows])
+        states.follow(split_joint(joint, n, self.spec.n_actions))
         self.updates += 1
         return loss.item()
 
@@ -193,6 +205,7 @@ class Pupil:
             "network": {name: t.numpy() for name, t in self.network.state_dict().items()},
             "optimiser": optimiser_arrays(self.optimiser),
             "states": self.states.arrays_by_name(),
+            "mistakes": {"seen": self.mistakes},
         }
         return {
             f"{part}.{key}": value for part, named in parts.items() for key, value in named.items()
@@ -200,13 +213,11 @@ class Pupil:
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
         """Take over what was saved."""
-        parts: dict[str, dict[str, np.ndarray]] = {"network": {}, "optimiser": {}, "states": {}}
-        for key, value in arrays.items():
-            part, _, name = key.partition(".")
-            parts[part][name] = value
-        self.network.load_state_dict({k: torch.from_numpy(v) for k, v in parts["network"].items()})
-        restore_optimiser(self.optimiser, parts["optimiser"])
-        self.states.restore(parts["states"])
+        weights = part(arrays, "network")
+        self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
+        restore_optimiser(self.optimiser, part(arrays, "optimiser"))
+        self.states.restore(part(arrays, "states"))
+        self.mistakes = arrays["mistakes.seen"].copy()
         self.updates = state["updates"]
         self.rng.bit_generator.state = state["rng"]
         self.losses = list(state["losses"])

@@ -131,14 +131,14 @@ def draw_comparison(
     folder
         Where comparison.png is written.
     summaries
-        A ``compare.Summary`` for each learner under each preset.
+        A ``studies.Summary`` for each learner under each preset.
     interval
-        Gives the mean over the first axis, and its interval: ``compare.interval``.
+        Gives the mean over the first axis, and its interval: ``studies.interval``.
     window
         Episodes in the running mean of each seed.
     """
-    presets = list(dict.fromkeys(summary.preset for summary in summaries))
-    learners = list(dict.fromkeys(summary.learner for summary in summaries))
+    presets = list(dict.fromkeys(summary.group[0] for summary in summaries))
+    learners = list(dict.fromkeys(summary.group[1] for summary in summaries))
     figure, grid = plt.subplots(
         len(presets),
         4,
@@ -148,16 +148,16 @@ def draw_comparison(
         width_ratios=(3, 3, 2, 2),
     )
     for preset, row in zip(presets, grid, strict=True):
-        shown = [summary for summary in summaries if summary.preset == preset]
+        shown = [summary for summary in summaries if summary.group[0] == preset]
         for summary in shown:
-            colour = LEARNER_COLOURS[learners.index(summary.learner) % len(LEARNER_COLOURS)]
+            colour = LEARNER_COLOURS[learners.index(summary.group[1]) % len(LEARNER_COLOURS)]
             for axes, name, factor in ((row[0], "returns", 1.0), (row[1], "solved", 100.0)):
                 curves = [getattr(outcome, name) for outcome in summary.outcomes]
                 width = min(window, min(map(len, curves)))
                 smooth = [np.convolve(c, np.ones(width) / width, mode="valid") for c in curves]
                 found = interval(factor * np.array(smooth))
                 episodes = np.arange(width, width + len(found.mean))
-                axes.plot(episodes, found.mean, color=colour, label=summary.learner)
+                axes.plot(episodes, found.mean, color=colour, label=summary.group[1])
                 if found.n > 1:
                     axes.fill_between(
                         episodes, found.low, found.high, color=colour, alpha=0.2, linewidth=0
@@ -177,7 +177,7 @@ def draw_comparison(
         row[3].set(xlabel="gap %, those solved")
         row[3].set_xlim(left=min(0.0, row[3].get_xlim()[0]))
         for axes in row[2:]:
-            axes.set_yticks([-i for i in range(len(shown))], [s.learner for s in shown])
+            axes.set_yticks([-i for i in range(len(shown))], [s.group[1] for s in shown])
             axes.set_ylim(-len(shown) + 0.5, 0.5)
         for axes in row:
             axes.spines[["top", "right"]].set_visible(False)

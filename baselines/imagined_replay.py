@@ -66,6 +66,9 @@ class ImaginedReplay:
         start anywhere, with any number of landmarks left.
     max_length
         Steps after which an imagined episode is given up.
+    retries
+        Probability that an episode that was given up is begun again from the depot, with the same
+        landmarks: so problems that the learner cannot solve stay until it can.
     """
 
     def __init__(
@@ -78,11 +81,12 @@ class ImaginedReplay:
         exploration: float,
         from_depot: float,
         max_length: int,
+        retries: float = 0.0,
     ) -> None:
         self.spec, self.depot = spec, depot
         self.n_tried = min(n_tried, spec.n_joint_actions)
         self.temperature, self.exploration = temperature, exploration
-        self.from_depot, self.max_length = from_depot, max_length
+        self.from_depot, self.max_length, self.retries = from_depot, max_length, retries
         n, k = spec.n_agents, spec.n_landmarks
         self.moves = np.full((spec.n_cells, spec.n_actions), UNKNOWN, np.int64)  # experienced
         self.cells = np.zeros((n_rows, n), np.int64)
@@ -116,17 +120,21 @@ class ImaginedReplay:
         """Return the imagined states as global observations (rows, N + 2K) float32."""
         return join(self.cells, self.landmarks, self.visited)
 
-    def start_over(self, rng: np.random.Generator) -> None:
-        """Begin a new episode in each row that has ended."""
-        ended = self.visited.all(axis=1) | (self.ages >= self.max_length)
+    def start_over(self, rng: np.random.Generator) -> np.ndarray:
+        """Begin a new episode in each row that has ended; return these rows' numbers."""
+        solved = self.visited.all(axis=1)
+        ended = solved | (self.ages >= self.max_length)
         count, k = int(ended.sum()), self.spec.n_landmarks
+        rows: np.ndarray = np.flatnonzero(ended)
         if count == 0:
-            return
+            return rows
         known = self._known_cells()
         anywhere = np.append(known, self.depot)
         cells = anywhere[rng.integers(len(anywhere), size=(count, self.spec.n_agents))]
         at_depot = rng.random(count) < self.from_depot
         landmarks = known[rng.random((count, len(known))).argpartition(k - 1, axis=1)[:, :k]]
+        again = ~solved[ended] & (rng.random(count) < self.retries)
+        landmarks[again], at_depot[again] = self.landmarks[ended][again], True
         if self.problem is not None:
             landmarks = rng.permuted(np.tile(self.problem, (count, 1)), axis=1)
         left = rng.integers(1, k + 1, size=count)
@@ -137,8 +145,11 @@ class ImaginedReplay:
         visited[at_depot] = False
         self.cells[ended], self.landmarks[ended], self.visited[ended] = cells, landmarks, visited
         self.ages[ended] = 0
+        return rows
 
-    def draw(self, values: np.ndarray, reward: RelabelledReward, rng: np.random.Generator) -> Batch:
+    def draw(
+        self, values: np.ndarray, reward: RelabelledReward, rng: np.random.Generator
+    ) -> tuple[Batch, np.ndarray]:
         """Return a transition for each row and action tried; then let the episodes go on.
 
         Parameters
@@ -149,6 +160,13 @@ class ImaginedReplay:
             How transitions are rewarded.
         rng
             Source of all choices.
+
+        Returns
+        -------
+        batch
+            The transitions.
+        followed
+            (rows,) which of the actions tried each episode goes on with.
         """
         n_rows = len(self.cells)
         before = self.observations()
@@ -178,7 +196,7 @@ class ImaginedReplay:
         # Where somebody has been but not moved from, the story ends.
         stuck = (self.moves[self.cells] == UNKNOWN).all(axis=2).any(axis=1)
         self.ages = np.where(stuck, self.max_length, self.ages + 1)
-        return batch
+        return batch, followed
 
     def follow(self, actions: np.ndarray) -> None:
         """Let the imagined episodes go on with joint actions (rows, N) whose moves are known."""
@@ -278,8 +296,9 @@ def try_actions(
                     for agent in range(n_agents):
                         cell = next_cells[row, tried, agent]
                         nearest = min(nearest, distances[cell, landmarks[row, k]])
-                    rewards[row, tried] -= nearest * scale
+                    rewards[row, tried] -= nearest
             if left and not distances.shape[0]:
-                rewards[row, tried] = -scale
+                rewards[row, tried] = -1.0
+            rewards[row, tried] *= scale  # as the environment's reward is when it was stored
             done[row, tried] = left == 0
     return joint, next_cells, next_visited, rewards, done

@@ -230,8 +230,12 @@ class AgentLearner(QLearner):
                 torch.from_numpy(batch.terminated[:, 0]),
                 following,
                 goal.discount,
-            )
-        return batch, targets.view(*batch.rewards.shape)
+            ).view(*batch.rewards.shape)
+            if args.action_gap and self.relabelled is not None:
+                here = self.target(torch.from_numpy(batch.observations))
+                taken = chosen_values(here, torch.from_numpy(batch.actions))
+                targets -= args.action_gap * (here[:, 0].amax(1, keepdim=True) - taken)
+        return batch, targets
 
     def chosen(self, values: Tensor, actions: Tensor) -> Tensor:
         """Return the values of the agent's own actions taken."""

@@ -24,6 +24,7 @@ SIGTERM (143) end a run early and leave a checkpoint.
 """
 
 import sys
+from typing import Any
 
 import numpy as np
 import torch
@@ -109,6 +110,8 @@ class MetaLearner(QLearner):
         super().__init__(args, grid, network, target, np.random.default_rng(streams.replay))
         self.memory: ReplayMemory | None = None
         self.imagined: ImaginedReplay | None = None
+        # The target network's values in the imagined states.
+        self.here = torch.zeros(args.batch_size, *self.spec.values_shape)
         if args.replay == "stored":
             self.memory = ReplayMemory(args.memory_size, self.spec.observation_size, args.n_agents)
         else:
@@ -121,6 +124,7 @@ class MetaLearner(QLearner):
                 args.imagined_exploration,
                 args.imagined_from_depot,
                 args.imagined_length,
+                args.imagined_retries,
             )
 
     # -- acting
@@ -165,32 +169,61 @@ class MetaLearner(QLearner):
 
     def prepare(self, progress: float) -> tuple[Batch, Tensor]:
         """Return a batch and the targets of its values."""
-        args = self.args
-        goal = self.goal(progress)
+        return self.prepare_stored() if self.imagined is None else self.prepare_imagined(progress)
+
+    def prepare_stored(self) -> tuple[Batch, Tensor]:
+        """Return transitions as they were played, and the targets of their values."""
+        assert self.memory is not None
+        args, batch = self.args, self.memory.sample(self.args.batch_size, self.rng)
+        rewards = args.reward_scale * torch.from_numpy(batch.rewards[:, 0])
         with torch.no_grad():
-            if self.memory is not None:
-                batch, known = self.memory.sample(args.batch_size, self.rng), None
-                scale = args.reward_scale
-            else:
-                assert self.imagined is not None
-                self.imagined.start_over(self.rng)
-                seen = torch.from_numpy(self.imagined.observations())
-                values = joint_values(self.target(seen), self.spec)
-                batch = self.imagined.draw(values.numpy(), goal.reward, self.rng)
-                scale = 1.0  # already in the reward
-            following = batch.next_observations.reshape(-1, self.spec.observation_size)
-            if self.imagined is not None:
-                known = self.imagined.known_actions(following)
-            seen = torch.from_numpy(following)
+            seen = torch.from_numpy(batch.next_observations[:, 0])
             values = self.target(seen)
             chooser = self.network(seen) if args.double else values
-            targets = td_targets(
-                scale * torch.from_numpy(batch.rewards.reshape(-1)),
-                torch.from_numpy(batch.terminated.reshape(-1)),
-                next_values(values, chooser, known),
-                goal.discount,
+            following = next_values(values, chooser, None)
+        terminated = torch.from_numpy(batch.terminated[:, 0])
+        return batch, td_targets(rewards, terminated, following, args.discount)[:, None]
+
+    def prepare_imagined(self, progress: float) -> tuple[Batch, Tensor]:
+        """Return imagined transitions, and the targets of their values."""
+        imagined, goal, spec = self.imagined, self.goal(progress), self.spec
+        assert imagined is not None
+        with torch.no_grad():
+            fresh = imagined.start_over(self.rng)
+            seen = torch.from_numpy(imagined.observations()[fresh])
+            self.here[fresh] = self.target(seen)
+            batch, followed = imagined.draw(
+                joint_values(self.here, spec).numpy(), goal.reward, self.rng
             )
-        return batch, targets.view(*batch.rewards.shape, *targets.shape[1:])
+            flat = batch.next_observations.reshape(-1, spec.observation_size)
+            seen = torch.from_numpy(flat)
+            values = self.target(seen)
+            chooser = self.network(seen) if self.args.double else values
+            targets = td_targets(
+                torch.from_numpy(batch.rewards.reshape(-1)),
+                torch.from_numpy(batch.terminated.reshape(-1)),
+                next_values(values, chooser, imagined.known_actions(flat)),
+                goal.discount,
+            ).view(*batch.rewards.shape, *self.here.shape[1:-1])
+            if self.args.action_gap:
+                known = imagined.known_actions(batch.observations)
+                best = next_values(self.here, self.here, known)[:, None]
+                taken = chosen_values(self.here, torch.from_numpy(batch.actions), spec)
+                targets -= self.args.action_gap * (best - taken)
+            # The episodes go on by these values, one update old by then.
+            n_rows, n_tried = batch.rewards.shape
+            goes_on = torch.from_numpy(np.arange(n_rows) * n_tried + followed)
+            self.here = values[goes_on]
+        return batch, targets
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        return {**super().arrays(), "here": self.here.numpy()}
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what was saved."""
+        super().restore(arrays, state)
+        self.here = torch.from_numpy(arrays["here"].copy())
 
     def chosen(self, values: Tensor, actions: Tensor) -> Tensor:
         """Return the values of the joint actions taken."""

@@ -11,8 +11,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
+from numba import njit  # type: ignore[import-untyped]
 from torch import Tensor, nn
 
+from baselines.bags import Bag
 from baselines.checks import check_choice, check_count, check_flag
 
 MAX_WEIGHTS = 20_000_000  # numbers in a network: 76 MiB
@@ -102,11 +104,11 @@ class NetworkSpec:
         if self.kind == "paper":
             first = (self.n_inputs + 1) * hidden + (hidden + 1) * hidden
         else:
-            first = self.n_cells * (self.n_cells + 2) * self.code_units
+            n_pairs = self.n_cells * (self.n_cells + 2)
+            first = n_pairs * self.code_units
             first += (self.n_cells + 1 + self.n_agents * self.code_units + 1) * hidden
             first += (self.n_inputs - self.observation_size) * hidden
-            crossed = self.n_agents * self.n_cells * (self.n_cells + 1)
-            first += self.landmark_units * (crossed + hidden)
+            first += self.landmark_units * (self.n_agents * n_pairs + hidden)
         return (self.n_agents if self.team == "independent" else 1) * (first + last)
 
     def as_dict(self) -> dict[str, int | str | bool]:
@@ -184,56 +186,93 @@ class PairsNetwork(nn.Module):
     tell itself from the others.
     """
 
-    places: Tensor
     orders: Tensor
     slots: Tensor
 
     def __init__(self, spec: NetworkSpec, generator: torch.Generator | None = None) -> None:
         super().__init__()
         self.spec = spec
-        n, cells, units = spec.n_agents, spec.n_cells, spec.code_units
-        # One more place for landmarks: where the visited ones are put.
-        self.pairs = bag(cells * (cells + 1), units, 0.3, generator)
-        self.cell = bag(cells, units, 0.3, generator)
-        self.unvisited = bag(cells + 1, spec.hidden_units, 0.1, generator)
+        n, units = spec.n_agents, spec.code_units
+        n_pairs = spec.n_cells * (spec.n_cells + 2)  # arrange says why 2
+        self.pairs = Bag(n_pairs, units, 0.3, generator)
+        self.unvisited = Bag(spec.n_cells + 1, spec.hidden_units, 0.1, generator)
         self.crossed = None
         n_codes = n * units
         if spec.landmark_units:
-            self.crossed = bag(n * cells * (cells + 1), spec.landmark_units, 0.3, generator)
-            self.register_buffer("slots", torch.arange(n) * (cells * (cells + 1)), persistent=False)
+            self.crossed = Bag(n * n_pairs, spec.landmark_units, 0.3, generator)
+            self.register_buffer("slots", torch.arange(n) * n_pairs, persistent=False)
             n_codes += spec.landmark_units
         self.hidden = linear(n_codes, spec.hidden_units, generator)
         self.head = Head(spec, generator)
-        self.whose = bag(n, spec.hidden_units, 0.1, generator) if spec.team == "shared" else None
-        self.register_buffer("places", n ** torch.arange(n), persistent=False)
+        self.whose = Bag(n, spec.hidden_units, 0.1, generator) if spec.team == "shared" else None
         self.register_buffer("orders", _joint_actions_by_order(spec), persistent=False)
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return action values, (B, N, A) or (B, A ** N), of global observations (B, N + 2K)."""
-        n, k = self.spec.n_agents, self.spec.n_landmarks
-        numbers = observations.long()
-        cells = numbers[:, :n]
-        if self.spec.team == "one":
-            cells, order = cells.sort(dim=1, stable=True)
-        flags = numbers[:, n + k : n + 2 * k]
-        landmarks = torch.where(flags > 0, self.spec.n_cells, numbers[:, n : n + k])
-        pairs = cells[:, :, None] * (self.spec.n_cells + 1) + landmarks[:, None, :]
-        codes = self.pairs(pairs.view(-1, k)) + self.cell(cells.reshape(-1, 1))
-        codes = torch.relu(codes).view(-1, n * self.spec.code_units)
+        spec = self.spec
+        n, k = spec.n_agents, spec.n_landmarks
+        pairs, landmarks, order = map(
+            torch.from_numpy,
+            arrange(observations.numpy(), n, k, spec.n_cells, spec.team == "one"),
+        )
+        codes = torch.relu_(self.pairs(pairs.view(-1, k + 1))).view(-1, n * spec.code_units)
         if self.crossed is not None:
-            seen = (pairs + self.slots[:, None]).transpose(1, 2).reshape(-1, n)
-            crossed = torch.relu(self.crossed(seen)).view(-1, k, self.spec.landmark_units).sum(1)
+            seen = (pairs[:, :, :k] + self.slots[:, None]).transpose(1, 2).reshape(-1, n)
+            crossed = torch.relu_(self.crossed(seen)).view(-1, k, spec.landmark_units).sum(1)
             codes = torch.cat((codes, crossed), 1)
         hidden = self.hidden(codes) + self.unvisited(landmarks)
         if self.whose is not None:
-            hidden = hidden + self.whose(numbers[:, n + 2 * k :].argmax(dim=1, keepdim=True))
-        values: Tensor = self.head(torch.relu(hidden))
-        if self.spec.team != "one":
+            whose = observations[:, n + 2 * k :].argmax(dim=1, keepdim=True)
+            hidden = hidden + self.whose(whose)
+        values: Tensor = self.head(torch.relu_(hidden))
+        if spec.team != "one":
             return values
-        if self.spec.outputs == "joint":
-            return values.gather(1, self.orders[(order * self.places).sum(1)])
+        if spec.outputs == "joint":
+            places = n ** torch.arange(n)
+            return values.gather(1, self.orders.index_select(0, (order * places).sum(1)))
         rank = order.argsort(dim=1)
-        return values.gather(1, rank[:, :, None].expand(-1, -1, self.spec.n_actions))
+        return values.gather(1, rank[:, :, None].expand(-1, -1, spec.n_actions))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def arrange(observations, n, k, n_cells, sort):  # type: ignore[no-untyped-def]
+    """Return what is to be looked up for global observations (B, N + 2K).
+
+    Two places are added to the grid's cells: where all visited landmarks are put, and one that
+    every agent pairs with besides, for what its cell says by itself.
+
+    Returns
+    -------
+    pairs
+        (B, N, K + 1) of each agent, its cell with each landmark's and with the second added place.
+    landmarks
+        (B, K) the landmarks' cells, or the first added place.
+    order
+        (B, N) the agents in the order of `pairs`: with `sort` that of their cells, of equal
+        ones the first.
+    """
+    n_rows, n_places = len(observations), n_cells + 2
+    pairs = np.empty((n_rows, n, k + 1), np.int64)
+    landmarks = np.empty((n_rows, k), np.int64)
+    order = np.empty((n_rows, n), np.int64)
+    for row in range(n_rows):
+        for index in range(k):
+            visited = observations[row, n + k + index] > 0
+            landmarks[row, index] = n_cells if visited else observations[row, n + index]
+        for agent in range(n):
+            place = agent
+            while sort and place > 0:
+                if observations[row, order[row, place - 1]] <= observations[row, agent]:
+                    break
+                order[row, place] = order[row, place - 1]
+                place -= 1
+            order[row, place] = agent
+        for agent in range(n):
+            cell = np.int64(observations[row, order[row, agent]])
+            for index in range(k):
+                pairs[row, agent, index] = cell * n_places + landmarks[row, index]
+            pairs[row, agent, k] = cell * n_places + n_cells + 1
+    return pairs, landmarks, order
 
 
 def _joint_actions_by_order(spec: NetworkSpec) -> Tensor:
@@ -311,13 +350,6 @@ def linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linea
     bound = 1.0 / math.sqrt(n_in)
     nn.init.uniform_(layer.weight, -bound, bound, generator=generator)
     nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
-    return layer
-
-
-def bag(n_in: int, n_out: int, std: float, generator: torch.Generator | None) -> nn.EmbeddingBag:
-    """Build a table of learned vectors that are looked up and summed."""
-    layer: nn.EmbeddingBag = nn.utils.skip_init(nn.EmbeddingBag, n_in, n_out, mode="sum")  # type: ignore
-    nn.init.normal_(layer.weight, std=std, generator=generator)
     return layer
 
 

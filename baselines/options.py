@@ -53,7 +53,7 @@ class Options:
     landmarks as a set, agents exchangeable (baselines/networks.py)"""
     outputs: Literal["joint", "agents"] = "joint"
     """a value for each joint action (64), or for each action of each agent (12, the paper's)"""
-    dueling: bool = False
+    dueling: bool = True
     """whether the output is a value plus advantages"""
     hidden_units: int = 256
     """rectifier units in a hidden layer"""
@@ -62,7 +62,7 @@ class Options:
     landmark_units: int = 0
     """numbers that describe a landmark in the network "pairs\""""
 
-    learning_rate: float = 0.004
+    learning_rate: float = 0.006
     """step size of Adam"""
     learning_rate_falls: bool = True
     """whether the step size falls in a straight line to 0 over the episodes"""
@@ -74,6 +74,10 @@ class Options:
     """what rewards are multiplied by, to keep values of the order of one"""
     huber: float = 0.3
     """error at which the loss turns from a square into a line"""
+    action_gap: float = 0.5
+    """how much of what an action falls short of the best one in its state is taken off its target:
+    advantage learning (Bellemare et al. 2016), which keeps the best action and widens the gap;
+    has no effect on stored transitions"""
     double: bool = False
     """whether the network picks the next action that the target network values"""
     batch_size: int = 512
@@ -113,6 +117,8 @@ class Options:
     """share of imagined episodes that start at the depot with all landmarks unvisited"""
     imagined_length: int = 16
     """steps after which an imagined episode is given up"""
+    imagined_retries: float = 0.9
+    """probability that an episode that was given up is begun again from the depot"""
 
     epsilon_start: float = 1.0
     """probability at the first step that an agent takes a random action"""
@@ -189,6 +195,7 @@ COUNTS = (
 NUMBERS = (
     ("learning_rate", 1e-12, 1.0),
     ("discount", 0.0, 1.0),
+    ("action_gap", 0.0, 1.0),
     ("reward_scale", 1e-6, 1e6),
     ("huber", 1e-6, 1e6),
     ("target_rate", 0.0, 1.0),
@@ -198,6 +205,7 @@ NUMBERS = (
     ("temperature", 1e-6, 1e6),
     ("imagined_exploration", 0.0, 1.0),
     ("imagined_from_depot", 0.0, 1.0),
+    ("imagined_retries", 0.0, 1.0),
     ("epsilon_start", 0.0, 1.0),
     ("epsilon_end", 0.0, 1.0),
     ("guidance_start", 0.0, 1.0),
@@ -211,6 +219,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "network": "paper",
         "outputs": "agents",
+        "dueling": False,
         "hidden_units": 512,
         "learning_rate": 0.001,
         "learning_rate_falls": False,
@@ -222,6 +231,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "update_interval": 4,
         "target_interval": 100,
         "final_reward": "same",
+        "action_gap": 0.0,
         "replay": "stored",
         "epsilon_steps": 10_000,
         "guidance_start": 1.0,

@@ -170,9 +170,14 @@ def test_target_network_is_copied_or_follows():
             torch.testing.assert_close(new, 0.8 * old + 0.2 * own.detach())
 
 
-def test_imagined_goal_changes_when_it_is_said_to():
-    """Up to a part of the training it is the env's reward, from then on the final one."""
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_imagined_goal_changes_when_it_is_said_to(gap):
+    """Up to a part of the training it is the env's reward, from then on the final one.
+
+    From the targets a share is taken of what the action falls short of the best one there.
+    """
     args = Args(
+        action_gap=gap,
         n_agents=1,
         n_landmarks=1,
         hidden_units=8,
@@ -204,7 +209,10 @@ def test_imagined_goal_changes_when_it_is_said_to():
         with torch.no_grad():
             following = torch.from_numpy(batch.next_observations.reshape(-1, 3))
             best = learner.target(following).max(dim=1).values.numpy().reshape(64, 4)
+            here = learner.target(torch.from_numpy(batch.observations)).numpy()
         expected = batch.rewards + np.where(batch.terminated, 0.0, discount * best)
+        taken = np.take_along_axis(here, batch.actions[:, :, 0], axis=1)
+        expected -= gap * (here.max(axis=1, keepdims=True) - taken)
         np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
 
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from scipy import stats
 
-from baselines import compare, experiment, independent_dqn, meta_dqn
-from baselines.compare import MEASURES, Args, Interval, format_interval, interval
+from baselines import compare, experiment, independent_dqn, meta_dqn, studies
+from baselines.compare import Args
 from baselines.options import parse_options
+from baselines.studies import MEASURES, Interval, format_interval, interval
 
 WORDS = [
     *("--n-problems", "1", "--episodes-per-problem", "4", "--max-cycles", "15"),
@@ -70,7 +71,7 @@ def test_finished_runs_are_not_repeated(compared, monkeypatch, capsys):
     def refuse(*arguments, **options):
         raise AssertionError("a process was started")
 
-    monkeypatch.setattr(compare.subprocess, "Popen", refuse)
+    monkeypatch.setattr(studies.subprocess, "Popen", refuse)
     assert compare.main(tiny(compared), WORDS) == 0
     assert "4 of 4 trainings were finished already" in capsys.readouterr().out
     assert [(compared / name).read_bytes() for name in names] == before
@@ -154,21 +155,21 @@ def test_failed_training_is_reported(tmp_path):
 
 def test_a_signal_stops_all_trainings(tmp_path, monkeypatch, capsys):
     """Exit code 143, no process left behind, and the comparison can go on."""
-    started, start = [], compare.start
+    started, start = [], studies.start
 
-    def starting(training, words):
-        process = start(training, words)
+    def starting(trial):
+        process = start(trial)
         started.append(process)
         os.kill(os.getpid(), signal.SIGTERM)
         return process
 
-    monkeypatch.setattr(compare, "start", starting)
+    monkeypatch.setattr(studies, "start", starting)
     assert compare.main(tiny(tmp_path, learners=("meta",)), WORDS) == 128 + signal.SIGTERM
     assert len(started) == 1
     assert started[0].returncode is not None
     assert "the same command goes on" in capsys.readouterr().out
     # Whatever state it was stopped in is one that a later call takes up.
-    compare.plan_trainings(tiny(tmp_path, learners=("meta",)), WORDS)
+    compare.plan_trials(tiny(tmp_path, learners=("meta",)), WORDS)
     shutil.rmtree(tmp_path)
 
 

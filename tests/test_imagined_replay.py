@@ -78,7 +78,7 @@ def round_of(replay, reward, rng):
     """Begin and draw once, with values that are chance; return the batch and the values."""
     replay.start_over(rng)
     values = rng.normal(size=(len(replay.cells), replay.spec.n_joint_actions)).astype(np.float32)
-    return replay.draw(values, reward, rng), values
+    return replay.draw(values, reward, rng)[0], values
 
 
 # -- what is imagined --------------------------------------------------------------------------
@@ -270,6 +270,30 @@ def test_only_ended_episodes_begin_anew():
     assert went_on
 
 
+@pytest.mark.parametrize("retries", [0.0, 0.6, 1.0])
+def test_given_up_episodes_are_tried_again(retries):
+    """Of the unsolved that ended, that share begins again with its landmarks; of the solved none.
+
+    Those that begin again stand at the depot with nothing visited.
+    """
+    grid = GRIDS["paper"]
+    rng = np.random.default_rng(0)
+    replay = make_replay(grid, 3, 5, n_rows=4000, from_depot=0.5, max_length=6, retries=retries)
+    experience(replay, grid, rng, 1.0)
+    replay.start_over(rng)
+    replay.visited[:1000] = True
+    replay.ages[1000:3000] = 6
+    before = replay.landmarks.copy()
+    np.testing.assert_array_equal(replay.start_over(rng), np.arange(3000))
+    same = (replay.landmarks == before).all(axis=1)
+    assert not same[:1000].any()
+    assert same[1000:3000].mean() == pytest.approx(retries, abs=0.05)
+    assert same[3000:].all()
+    again = np.flatnonzero(same[:3000])
+    assert (replay.cells[again] == grid.depot).all()
+    assert not replay.visited[again].any()
+
+
 def test_stuck_states_end_the_story():
     """Where an agent has come to a cell that nobody has left, the next draw begins anew."""
     replay = make_replay(GRIDS["corridor"], 1, 1, n_rows=200, from_depot=1.0, max_length=50)
@@ -360,7 +384,7 @@ def test_exploration_is_the_share_of_other_actions_followed():
         experience(replay, grid, rng, 1.0)
         replay.start_over(rng)
         values = np.tile(np.array([0.0, 0.1, 0.0, 0.0], np.float32), (4000, 1))
-        batch = replay.draw(values, relabelled_reward(grid, "step", 1.0), rng)
+        batch, _ = replay.draw(values, relabelled_reward(grid, "step", 1.0), rng)
         rows = np.arange(4000)
         # From the depot in the open every action leads elsewhere.
         followed = (batch.next_observations[:, :, 0] == replay.cells).argmax(axis=1)

@@ -190,13 +190,15 @@ def test_team_reward_teaches_each_agent_its_own_action(seed):
     assert greedy == [[LEFT, DOWN], [RIGHT, UP]]
 
 
+@pytest.mark.parametrize("gap", [0.0, 0.5])
 @pytest.mark.parametrize("share", [False, True])
-def test_no_target_is_above_what_the_rules_can_bring(share):
+def test_no_target_is_above_what_the_rules_can_bring(share, gap):
     """However high a network's values have become, targets of relabelled transitions are 0 at most.
 
-    Below that they are the reward and the discounted best next value of the target network.
+    Below that they are the reward and the discounted best next value of the target network, less
+    a share of what the action falls short of the best one.
     """
-    team = make("default", share_parameters=share)
+    team = make("default", share_parameters=share, action_gap=gap)
     for transition in walk(np.random.default_rng(0), 200):
         team.remember(*transition)
     for learner in team.learners:
@@ -207,9 +209,12 @@ def test_no_target_is_above_what_the_rules_can_bring(share):
             assert (targets <= 0).all()
             with torch.no_grad():
                 best = learner.target(torch.from_numpy(batch.next_observations[:, 0]))[:, 0]
+                here = learner.target(torch.from_numpy(batch.observations))[:, 0].numpy()
             best = best.max(dim=1).values.clamp(max=0).numpy()
             going_on = 0.95 * best * ~batch.terminated[:, 0]
-            np.testing.assert_allclose(targets[:, 0], batch.rewards[:, 0] + going_on, rtol=1e-5)
+            taken = here[np.arange(len(here)), batch.actions[:, 0, 0]]
+            expected = batch.rewards[:, 0] + going_on - gap * (here.max(axis=1) - taken)
+            np.testing.assert_allclose(targets[:, 0], expected, rtol=1e-5, atol=1e-5)
 
 
 # -- relabelled replay -------------------------------------------------------------------------

@@ -1,0 +1,147 @@
+"""How soon an answer is there: trained networks beside the solvers, on one core.
+
+Random problems of `paper-7x7`, three agents, five landmarks, cover time. "one problem" is the
+median time from a problem to its plan, one problem after another; a network's "one step" is what
+somebody waits for who asks it for the next joint action only. "in batches" is the time for each of
+many problems that are handed over together: of a network with the rules to play its episodes, of
+the exact solver for the costs alone. Searches end when they have found the optimum, which they do
+not know themselves. All is loaded and compiled before; times drift with the machine.
+
+    python benchmarks/latency.py                          # half a minute
+    python benchmarks/latency.py --policies pretrained runs/mine
+"""
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse
+import importlib.util
+import time
+from collections.abc import Callable
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from baselines.evaluation import Optima, evaluate, find_optima
+from baselines.guidance import Acting
+from baselines.policy import NearestLandmarkPolicy, load_policy, pretrained_names
+from baselines.settings import Setting
+from mapp_env import Problem, make_grid, replay, sample_problems, solve
+from mapp_env.solvers import optimal_costs
+from mapp_env.solvers.pyvrp import solve_pyvrp
+from mapp_env.solvers.search import solve_search
+
+SETTING = Setting(make_grid())
+
+
+class Row(NamedTuple):
+    """A row of the table."""
+
+    label: str
+    one: float  # milliseconds
+    each: float | None  # microseconds
+    optimal: float | None  # per cent of the problems
+
+
+def time_each(function: Callable[[Problem], object], problems: list[Problem]) -> float:
+    """Return the median milliseconds that a function takes."""
+    times = []
+    for problem in problems:
+        start = time.perf_counter()
+        function(problem)
+        times.append(time.perf_counter() - start)
+    return 1e3 * median(times)
+
+
+def time_batch(function: Callable[[np.ndarray], object], landmarks: np.ndarray) -> float:
+    """Return microseconds for each problem, the best of three."""
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        function(landmarks)
+        times.append(time.perf_counter() - start)
+    return 1e6 * min(times) / len(landmarks)
+
+
+def time_search(solver: Callable[..., object], problem: Problem, optimum: int) -> float:
+    """Return the milliseconds until a search has found the optimum; infinite if not in 0.2 s."""
+    found = [float("inf")]
+    start = time.perf_counter()
+
+    def note(cost: int) -> None:
+        if cost == optimum:
+            found[0] = min(found[0], 1e3 * (time.perf_counter() - start))
+
+    solver(problem, "cover_time", time_limit=0.2, seed=0, on_better=note)
+    return found[0]
+
+
+def policy_rows(
+    label: str, policy: Acting, problems: list[Problem], many: np.ndarray, optima: Optima | None
+) -> list[Row]:
+    """Return the rows of a policy: one step, and whole episodes."""
+    n_flags = SETTING.n_landmarks
+    starts = {
+        problem: np.array(
+            [[problem.grid.depot] * SETTING.n_agents + [*problem.landmarks] + [0] * n_flags],
+            np.float32,
+        )
+        for problem in problems
+    }
+    shortest = evaluate(policy, SETTING, many, optima).summary()["optimal %"]
+    step = time_each(lambda problem: policy.act(starts[problem]), problems)
+    whole = time_each(
+        lambda problem: replay(
+            problem,
+            evaluate(policy, SETTING, np.array([problem.landmarks]), n_kept=1).actions[:, 0],
+        ),
+        problems,
+    )
+    each = time_batch(lambda landmarks: evaluate(policy, SETTING, landmarks), many)
+    return [Row(f"{label}, one step", step, None, None), Row(label, whole, each, shortest)]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policies", nargs="*", default=pretrained_names(), help="of networks")
+    parser.add_argument("--problems", type=int, default=100, help="one after another")
+    parser.add_argument("--batch", type=int, default=20_000, help="handed over together")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    grid, n_agents = SETTING.grid, SETTING.n_agents
+    many = sample_problems(grid, args.batch, SETTING.n_landmarks, seed=1)
+    problems = [Problem(grid, row, n_agents) for row in many[: args.problems].tolist()]
+    optima = find_optima(SETTING, many)
+    rows: list[Row] = []
+    for name in args.policies:
+        rows += policy_rows(name, load_policy(name), problems, many, optima)
+    nearest = NearestLandmarkPolicy(grid, n_agents, SETTING.n_landmarks)
+    rows += policy_rows("nearest landmark", nearest, problems, many, optima)[1:]
+    solve(problems[0])
+    whole = time_each(solve, problems)
+    each = time_batch(lambda landmarks: optimal_costs(grid, landmarks, n_agents), many)
+    rows.append(Row("exact solver", whole, each, 100.0))
+    costs = optimal_costs(grid, many, n_agents).tolist()
+    for label, solver in (("search", solve_search), ("PyVRP", solve_pyvrp)):
+        if label == "PyVRP" and importlib.util.find_spec("pyvrp") is None:
+            continue
+        time_search(solver, problems[0], costs[0])
+        times = [time_search(solver, *case) for case in zip(problems, costs, strict=False)]
+        rows.append(Row(label, median(times), None, 100.0 * float(np.isfinite(times).mean())))
+
+    print("|                                | one problem, ms | in batches, us each | optimal % |")
+    print("|--------------------------------|----------------:|--------------------:|----------:|")
+    for row in rows:
+        batched, shortest = ("-" if x is None else f"{x:.2f}" for x in (row.each, row.optimal))
+        print(f"| {row.label:<30} | {row.one:15.3f} | {batched:>19} | {shortest:>9} |")
+
+
+if __name__ == "__main__":
+    main()
