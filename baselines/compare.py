@@ -54,6 +54,8 @@ class Args:
     )
     """learners to compare: one network commands all agents, each agent has its own, or all use one
     by themselves"""
+    default_updates: int = 40
+    """updates after each episode under the preset default; 40 are its own"""
     seeds: int = 5
     """trainings of each: seeds 0, 1, 2 ..."""
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -64,6 +66,7 @@ class Args:
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name} must be one or more, none twice, got {values!r}")
+        check_count("default_updates", self.default_updates, 1, 1_000_000)
         check_count("seeds", self.seeds, 1, 10_000)
         check_count("jobs", self.jobs, 1, 1024)
 
@@ -82,6 +85,8 @@ def plan_trials(args: Args, words: Sequence[str]) -> list[Trial]:
             for learner in args.learners:
                 algorithm, kind, own = LEARNERS[learner]
                 own = ("--preset", preset, *own)
+                if preset == "default":
+                    own += ("--updates-per-episode", str(args.default_updates))
                 group = (preset, learner)
                 trials.append(plan_trial(group, seed, args.out, (algorithm, kind), own, words))
     return trials

@@ -94,7 +94,7 @@ def test_stopped_and_resumed_is_the_same(tmp_path, monkeypatch):
     """Stopped by SIGTERM and resumed: the same bytes of metrics and weights."""
     options = {**SMALL, "updates": 250, "checkpoint_seconds": 1e9}
     assert distill.main(distill.Args(out=tmp_path / "whole", **options)) == 0
-    update, calls = distill.Pupil.update, []
+    update, calls = distill.Distilled.update, []
 
     def interrupted(self):
         calls.append(None)
@@ -103,7 +103,7 @@ def test_stopped_and_resumed_is_the_same(tmp_path, monkeypatch):
         return update(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(distill.Pupil, "update", interrupted)
+        patch.setattr(distill.Distilled, "update", interrupted)
         assert distill.main(distill.Args(out=tmp_path / "run", **options)) == 143
     assert distill.main(distill.Args(resume=tmp_path / "run")) == 0
     for name in ("metrics.csv", "policy.safetensors"):

@@ -1,0 +1,291 @@
+"""Imitation: a network is taught, state by state, which joint actions to take.
+
+What distillation (``distill.py``: the exact solver says it) and self-improvement
+(``self_improve.py``: the best of several own episodes says it) have in common: the updates, the run
+folder, checkpoints, and the table at the end. A pupil's network is trained as a classifier: its
+outputs are read as logits, and the greedy policy takes the largest, as it does of values.
+"""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from baselines.checkpoints import Checkpoints
+from baselines.checks import check_count, check_number
+from baselines.evaluation import evaluate, find_optima, format_table, save_table, unseen_problems
+from baselines.networks import Network
+from baselines.optimiser import optimiser_arrays, restore_optimiser
+from baselines.policy import NetworkPolicy, save_policy
+from baselines.q_learner import part
+from baselines.runs import (
+    TIMING_FILE,
+    WEIGHTS_FILE,
+    RunFolder,
+    StopSignals,
+    default_folder,
+    read_config,
+)
+from baselines.settings import Setting
+from mapp_env import Grid
+
+METRICS = ("updates", "loss")
+LOGGED = 100  # updates in a row of metrics.csv
+WARMUP = 200  # updates over which the step size rises to its value
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of an imitation."""
+
+    seed: int = 0
+    """seed of everything random"""
+    out: Path | None = None
+    """the run folder, new or empty; by default runs/ALGORITHM-default-seedSEED-TIME"""
+    resume: Path | None = None
+    """a run folder whose training goes on where it stopped, with its own options"""
+    updates: int = 60_000
+    """steps of Adam"""
+    learning_rate: float = 0.003
+    """step size of Adam; it falls in a straight line to 0"""
+    evaluation_problems: int = 1000
+    """problems for the table at the end, 0 for none"""
+    checkpoint_seconds: float = 30.0
+    """seconds between two checkpoints; 0 for one after every update"""
+    threads: int = 1
+    """threads of PyTorch"""
+
+    def __post_init__(self) -> None:
+        check_count("seed", self.seed, 0, 2**63 - 1)
+        check_count("updates", self.updates, 1, 1_000_000_000)
+        check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
+        check_count("evaluation_problems", self.evaluation_problems, 0, 1_000_000)
+        check_number("checkpoint_seconds", self.checkpoint_seconds, 0.0, 1e9)
+        check_count("threads", self.threads, 1, 1024)
+
+
+class Pupil(ABC):
+    """A network, its optimiser, and what it is taught.
+
+    Parameters
+    ----------
+    args
+        Options.
+    network
+        What is trained.
+    rng
+        Source of everything random.
+    """
+
+    def __init__(self, args: Options, network: Network, rng: np.random.Generator) -> None:
+        self.args, self.network, self.rng = args, network, rng
+        self.spec = network.spec
+        self.optimiser = torch.optim.Adam(self.network.parameters(), fused=True)
+        self.updates = 0
+        self.losses: list[float] = []  # since the last row of metrics.csv
+        self.seconds = 0.0
+
+    @abstractmethod
+    def lesson(self) -> Tensor:
+        """Return the loss of the next batch."""
+
+    @abstractmethod
+    def own_arrays(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return the arrays that lessons change, by part and name."""
+
+    @abstractmethod
+    def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
+        """Take over what :meth:`own_arrays` returned."""
+
+    def update(self) -> None:
+        """Learn from one batch."""
+        start = time.perf_counter()
+        loss = self.lesson()
+        rate = self.args.learning_rate * (1 - self.updates / self.args.updates)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate * min(1.0, (self.updates + 1) / WARMUP)
+        self.optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        self.updates += 1
+        self.losses.append(loss.item())
+        self.seconds += time.perf_counter() - start
+
+    # -- checkpoints
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        parts = {
+            "network": {name: t.numpy() for name, t in self.network.state_dict().items()},
+            "optimiser": optimiser_arrays(self.optimiser),
+            **self.own_arrays(),
+        }
+        return {
+            f"{name}.{key}": value for name, named in parts.items() for key, value in named.items()
+        }
+
+    def state(self) -> dict[str, Any]:
+        """Return all else that changes, ready for JSON."""
+        return {
+            "updates": self.updates,
+            "rng": self.rng.bit_generator.state,
+            "losses": self.losses,
+            "seconds": self.seconds,
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what was saved."""
+        weights = part(arrays, "network")
+        self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
+        restore_optimiser(self.optimiser, part(arrays, "optimiser"))
+        self.restore_own(arrays)
+        self.updates, self.seconds = state["updates"], state["seconds"]
+        self.rng.bit_generator.state = state["rng"]
+        self.losses = list(state["losses"])
+
+
+# -- the run -----------------------------------------------------------------------------------
+
+Chosen = TypeVar("Chosen", bound=Options)
+
+
+def own_options(args: Chosen, algorithm: str) -> tuple[Chosen, Mapping[str, Any] | None]:
+    """Return a run's options, and its config if it is resumed.
+
+    Raises
+    ------
+    ValueError
+        If others are given beside ``resume``, or the folder is none of this algorithm's runs.
+    """
+    if args.resume is None:
+        return args, None
+    kind = type(args)
+    if args != kind(resume=args.resume):
+        raise ValueError("resume goes on with the run's own options: leave out all others")
+    config = read_config(args.resume)
+    options = config.get("options")
+    if config.get("algorithm") != algorithm or not isinstance(options, dict):
+        raise ValueError(f"{args.resume}: not a run of {algorithm}")
+    names = {field.name for field in fields(kind)}
+    try:
+        own = {name: value for name, value in options.items() if name in names}
+        return kind(**{**own, "out": None, "resume": args.resume}), config
+    except TypeError as error:
+        raise ValueError(f"{args.resume}: {error}") from error
+
+
+def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals) -> None:
+    """Teach until all updates are done, or a signal comes; then leave a checkpoint."""
+    args = pupil.args
+
+    def save() -> None:
+        state = {**pupil.state(), "metrics": run.position()}
+        checkpoints.save(pupil.updates, pupil.arrays(), state)
+
+    bar = tqdm(total=args.updates, initial=pupil.updates, unit=" updates", disable=None)
+    saved = time.monotonic()
+    while pupil.updates < args.updates and signals.received is None:
+        pupil.update()
+        bar.update()
+        if pupil.updates % LOGGED == 0:
+            run.log({"updates": pupil.updates, "loss": sum(pupil.losses) / LOGGED})
+            pupil.losses.clear()
+        if time.monotonic() - saved >= args.checkpoint_seconds:
+            save()
+            saved = time.monotonic()
+    bar.close()
+    save()
+    save_policy(run.path(WEIGHTS_FILE), pupil.network)
+    run.write_json(
+        TIMING_FILE, {"updates": pupil.updates, "seconds_total": round(pupil.seconds, 3)}
+    )
+
+
+def run_imitation(
+    args: Options,
+    algorithm: str,
+    setting: Setting,
+    make_pupil: Callable[[], Pupil],
+    seen: list[tuple[int, ...]],
+) -> int:
+    """Teach and evaluate; return the exit code.
+
+    Parameters
+    ----------
+    args
+        Options, of a resumed run its own.
+    algorithm
+        Name of the run's kind.
+    setting
+        What the agents have to do.
+    make_pupil
+        Builds what is taught.
+    seen
+        Problems that are none of those evaluated.
+    """
+    torch.set_num_threads(args.threads)
+    pupil = make_pupil()
+    folder = args.resume or args.out or default_folder(algorithm, "default", args.seed)
+    task = {name: getattr(setting, name) for name in ("n_agents", "n_landmarks", "max_cycles")}
+    identity = {
+        "algorithm": algorithm,
+        "options": {**asdict_of(args), **task, "out": None, "resume": None},
+        "grid": setting.grid.to_text(),
+        "training_problems": seen,
+    }
+    run = RunFolder(folder, METRICS, resume=args.resume is not None)
+    signals = StopSignals()
+    try:
+        checkpoints = Checkpoints(folder, identity)
+        if args.resume is None:
+            run.write_config(identity)
+        else:
+            go_on(pupil, run, checkpoints)
+        with signals:
+            train(pupil, run, checkpoints, signals)
+        if signals.received is not None:
+            print(f"stopped early; go on with --resume {folder}", flush=True)
+            return 128 + signals.received
+        if args.evaluation_problems:
+            problems = unseen_problems(setting, args.evaluation_problems, seen)
+            policy = NetworkPolicy(pupil.network)
+            optima = find_optima(setting, problems)
+            table = {"network alone": evaluate(policy, setting, problems, optima)}
+            save_table(folder, table)
+            print(format_table(table))
+    except OSError as error:
+        raise ValueError(f"{folder}: cannot be written: {error}") from error
+    finally:
+        run.close()
+    print(f"\nrun folder: {folder}")
+    return 0
+
+
+def asdict_of(args: Options) -> dict[str, Any]:
+    """Return options ready for JSON: paths as text."""
+    return {k: str(v) if isinstance(v, Path) else v for k, v in asdict(args).items()}
+
+
+def go_on(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints) -> None:
+    """Bring a training to its newest whole checkpoint, or to its start if there is none."""
+    checkpoint, problems = checkpoints.latest()
+    for problem in problems:
+        print(f"not used: {problem}")
+    if checkpoint is None:
+        run.restart()
+        return
+    run.rewind(checkpoint.state["metrics"])
+    pupil.restore(checkpoint.arrays, checkpoint.state)
+    print(f"going on from update {pupil.updates + 1:,}")
+
+
+def stored_grid(config: Mapping[str, Any]) -> Grid:
+    """Return the grid in a run's config."""
+    return Grid.from_text(config["grid"])
