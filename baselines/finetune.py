@@ -1,8 +1,10 @@
 """Train a policy a little further on one problem: the paper's "short training on the problem".
 
-Method: at most 30 more episodes on the problem. The first ones walk at random, so that it is known
-where moves lead; the others are the policy's own. After each, the network learns from episodes
-imagined on this problem alone (``imagined_replay``), with one step's cost as the reward.
+Method: at most 30 more episodes on the problem. The first one is the policy's own, the next ones
+walk at random, so that it is known where moves lead. Before each of the others the network plays
+many episodes on this problem in imagination, along the moves that were made, with actions drawn
+from its own values, and learns to do what it did in the shortest (``self_improve`` does the same on
+all problems); then it plays greedily for real. Neither the walls nor the optimum are looked up.
 
 Paper: section 5, last paragraph (arXiv 2110.01460).
 
@@ -17,25 +19,31 @@ With ``--problems`` that many unseen problems which the policy does not solve op
 fine-tuned, and it is said of how many the optimum was found.
 """
 
+import copy
 import sys
 import time
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import tyro
+from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
 from baselines.checks import check_count, check_number
 from baselines.evaluation import count_unseen, evaluate, find_optima, unseen_problems
-from baselines.meta_dqn import Args as TrainingArgs
-from baselines.meta_dqn import MetaLearner
-from baselines.options import preset_options
+from baselines.imagined_replay import UNKNOWN, is_on, join
+from baselines.meta_dqn import joint_values
+from baselines.networks import Network, split_joint
 from baselines.policy import NetworkPolicy, find_weights
 from baselines.settings import N_ACTIONS, Setting, read_setting
-from baselines.training import Streams
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
+
+# Values of one network differ by tenths where logits of another differ by tens: actions are drawn
+# at sharpnesses from one end to the other, episode by episode.
+SHARPNESS = (0.5, 16.0)
 
 
 @dataclass
@@ -48,10 +56,14 @@ class Args(solving.Args):
     """most episodes to play"""
     random_episodes: int = 8
     """how many of them walk at random"""
-    updates_per_episode: int = 15
-    """updates after each of the others"""
+    imagined: int = 256
+    """episodes imagined before each of the others"""
+    updates_per_episode: int = 10
+    """updates after that"""
     learning_rate: float = 0.002
-    """step size of Adam; it falls in a straight line to 0"""
+    """step size of Adam"""
+    patience: int = 6
+    """it ends early when so many of its own episodes have not become shorter"""
     seed: int = 0
     """seed of everything random"""
 
@@ -59,51 +71,92 @@ class Args(solving.Args):
         check_count("problems", self.problems, 0, 1_000_000)
         check_count("episodes", self.episodes, 1, 30)
         check_count("random_episodes", self.random_episodes, 0, self.episodes - 1)
+        check_count("imagined", self.imagined, 1, 65_536)
         check_count("updates_per_episode", self.updates_per_episode, 1, 10_000)
         check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
+        check_count("patience", self.patience, 1, 30)
         check_count("seed", self.seed, 0, 2**63 - 1)
 
 
-def make_learner(
-    args: Args, policy: NetworkPolicy, setting: Setting, problem: Problem
-) -> MetaLearner:
-    """Return a learner that goes on from a policy, on one problem alone.
+class Episode(NamedTuple):
+    """What was seen and done until all landmarks were visited."""
 
-    Raises
-    ------
-    ValueError
-        If the policy is no meta-agent's: independent learners have no joint actions to try.
+    seen: np.ndarray  # (T, D) float32
+    joint: np.ndarray  # (T,) int64, joint actions
+
+
+class Tuner:
+    """A network, what it knows of the grid, and the problem it is trained on.
+
+    Parameters
+    ----------
+    args
+        Options.
+    network
+        Whose values tell good joint actions from bad ones; it is copied.
+    problem
+        The problem.
     """
-    spec = policy.spec
-    if spec.team != "one":
-        raise ValueError(f"policy must be a meta-agent's, got one of {spec.team} learners")
-    training = preset_options(
-        TrainingArgs,
-        "default",
-        seed=args.seed,
-        n_agents=spec.n_agents,
-        n_landmarks=spec.n_landmarks,
-        network=spec.kind,
-        outputs=spec.outputs,
-        dueling=spec.dueling,
-        hidden_units=spec.hidden_units,
-        code_units=spec.code_units,
-        landmark_units=spec.landmark_units,
-        learning_rate=args.learning_rate,
-        learning_rate_warmup=0,
-        batch_size=256,
-        # One problem has few states, so more of what could be done is tried.
-        tried_actions=4,
-        imagined_exploration=0.3,
-        final_from=0.0,
-        prefetch=False,
-    )
-    learner = MetaLearner(training, setting.grid, Streams.spawn(args.seed))
-    for network in (learner.network, learner.target):
-        network.load_state_dict(policy.network.state_dict())
-    assert learner.imagined is not None
-    learner.imagined.problem = np.array(problem.landmarks)
-    return learner
+
+    def __init__(self, args: Args, network: Network, problem: Problem) -> None:
+        self.args, self.problem = args, problem
+        self.network = copy.deepcopy(network)
+        self.spec = network.spec
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=args.learning_rate)
+        self.rng = np.random.default_rng(args.seed)
+        self.moves = np.full((problem.grid.n_cells, N_ACTIONS), UNKNOWN, np.int64)  # experienced
+        self.digits = split_joint(np.arange(self.spec.n_joint_actions), self.spec.n_agents, 4)
+        self.best: Episode | None = None
+
+    def remember(self, seen: np.ndarray, actions: np.ndarray, following: np.ndarray) -> None:
+        """Keep where each agent's move has led."""
+        n = self.spec.n_agents
+        self.moves[seen[:n].astype(np.int64), actions] = following[:n]
+
+    def train(self) -> None:
+        """Imagine episodes, and learn to do what was done in the shortest so far."""
+        found = self.imagine()
+        if found is not None and (self.best is None or len(found.joint) < len(self.best.joint)):
+            self.best = found
+        if self.best is None:
+            return
+        seen, joint = map(torch.from_numpy, self.best)
+        for _ in range(self.args.updates_per_episode):
+            scores = joint_values(self.network(seen), self.spec)
+            loss = nn.functional.cross_entropy(scores, joint)
+            self.optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimiser.step()
+
+    def imagine(self) -> Episode | None:
+        """Return the shortest of many imagined episodes, None if none visits all landmarks."""
+        n_rows, problem = self.args.imagined, self.problem
+        sharpness = np.geomspace(*SHARPNESS, n_rows, dtype=np.float32)[:, None]
+        cells = np.full((n_rows, self.spec.n_agents), problem.grid.depot)
+        landmarks = np.tile(np.array(problem.landmarks), (n_rows, 1))
+        visited = np.zeros(landmarks.shape, np.bool_)
+        seen, taken = [], []
+        limit = problem.max_cycles if self.best is None else len(self.best.joint)
+        for _ in range(limit or 0):
+            known = (self.moves[cells[:, None, :], self.digits] != UNKNOWN).all(axis=2)
+            going_on = known.any(axis=1)  # the others are where nobody has moved from
+            if not going_on.any():
+                return None
+            seen.append(join(cells, landmarks, visited))
+            with torch.inference_mode():
+                values = joint_values(self.network(torch.from_numpy(seen[-1])), self.spec)
+            # The largest of logits and Gumbel noise is a draw from the policy.
+            scores = sharpness * values.numpy() + self.rng.gumbel(size=known.shape)
+            joint = np.where(known, scores, -np.inf).argmax(axis=1)
+            taken.append(joint)
+            moved = self.moves[cells, self.digits[joint]]
+            cells = np.where(going_on[:, None], moved, cells)
+            visited = visited | (is_on(cells, landmarks) & going_on[:, None])
+            done = visited.all(axis=1)
+            if done.any():
+                row = int(done.argmax())
+                return Episode(np.stack(seen)[:, row], np.stack(taken)[:, row])
+        return None
 
 
 def finetune(
@@ -111,54 +164,46 @@ def finetune(
 ) -> tuple[Plan, int]:
     """Return the best plan of the episodes played, and how many they were.
 
-    It ends early when an episode is as short as the way to the farthest landmark.
+    It ends early when an episode is as short as the way to the farthest landmark, or nothing has
+    become better for a while.
     """
-    learner = make_learner(args, policy, setting, problem)
+    tuner = Tuner(args, policy.network, problem)
     env = mapp_v0.parallel_env(
         setting.grid, setting.n_agents, setting.n_landmarks, setting.max_cycles
     )
-    rng = np.random.default_rng(args.seed)
     farthest = max(int(setting.grid.home[cell]) for cell in problem.landmarks)
     best: Plan | None = None
-    own = args.episodes - args.random_episodes
+    waited = 0
     for episode in range(args.episodes):
         random = 0 < episode <= args.random_episodes  # the first shows what the policy can do
-        plan = play(env, learner, problem, rng if random else None)
+        if episode > args.random_episodes:
+            tuner.train()
+        plan = play(env, tuner, random)
+        waited += episode > args.random_episodes
         if best is None or (plan.success, -plan.cover_time) > (best.success, -best.cover_time):
-            best = plan
-        if best.success and best.cover_time <= farthest:
+            best, waited = plan, 0
+        if best.success and (best.cover_time <= farthest or waited >= args.patience):
             return best, episode + 1
-        if episode >= args.random_episodes and learner.ready:
-            done = (episode - args.random_episodes) / own
-            for _ in range(args.updates_per_episode):
-                learner.update(done)
     assert best is not None
     return best, args.episodes
 
 
-def play(
-    env: mapp_v0.parallel_env,
-    learner: MetaLearner,
-    problem: Problem,
-    rng: np.random.Generator | None,
-) -> Plan:
-    """Play an episode, by the learner or at random, and let the learner remember it."""
+def play(env: mapp_v0.parallel_env, tuner: Tuner, random: bool) -> Plan:
+    """Play an episode, greedily or at random, and remember where the moves led."""
     leader = env.possible_agents[0]
-    seen = env.reset(options={"landmarks": list(problem.landmarks)})[0][leader]
+    policy = NetworkPolicy(tuner.network)
+    seen = env.reset(options={"landmarks": list(tuner.problem.landmarks)})[0][leader]
     taken = []
     while env.agents:
-        if rng is None:
-            actions = learner.act(seen)
+        if random:
+            actions = tuner.rng.integers(N_ACTIONS, size=len(env.agents))
         else:
-            actions = rng.integers(N_ACTIONS, size=len(env.agents))
-        following, rewards, terminations, _, _ = env.step(
-            dict(zip(env.agents, actions.tolist(), strict=True))
-        )
-        ended = terminations[leader]
-        learner.remember(seen, actions, rewards[leader], following[leader], ended)
-        seen = following[leader]
+            actions = policy.act(seen[None])[0]
+        following = env.step(dict(zip(env.agents, actions.tolist(), strict=True)))[0][leader]
+        tuner.remember(seen, actions, following)
+        seen = following
         taken.append(actions)
-    return replay(replace(problem, max_cycles=None), np.array(taken))
+    return replay(replace(tuner.problem, max_cycles=None), np.array(taken))
 
 
 def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[int, ...]]) -> None:

@@ -3,10 +3,10 @@
 Method: self-imitation. Of each random problem several episodes are played at once in the batched
 environment: one greedily, the others with actions drawn from the policy. The shortest is what the
 network is taught, the greedy one if none is shorter; what was found to be shorter is kept and
-taught again for a while. This is reinforcement learning by trial alone: all that is known of a problem is
-how long one's own episodes on it took, never the optimum, and walls are met by bumping into them.
-In the spirit of self-imitation learning (Oh et al. 2018) and of the classifiers of rollout-based
-policy iteration (Lagoudakis and Parr 2003).
+taught again for a while. This is reinforcement learning by trial alone: all that is known of a
+problem is how long one's own episodes on it took, never the optimum, and walls are met by bumping
+into them. In the spirit of self-imitation learning (Oh et al. 2018) and of the classifiers of
+rollout-based policy iteration (Lagoudakis and Parr 2003).
 
 It starts from a policy of ``meta_dqn.py``: the larger its values, the likelier its actions.
 
@@ -47,13 +47,13 @@ class Args(Options):
 
     policy: Path | None = None
     """the run folder of a meta-agent with joint values, to start from"""
-    learning_rate: float = 0.001
+    learning_rate: float = 0.002
     """step size of Adam; it falls in a straight line to 0"""
     problems: int = 512
     """random problems that are played at a time"""
     episodes: int = 8
     """episodes of each, the first of them greedy"""
-    updates_per_round: int = 12
+    updates_per_round: int = 24
     """updates after each time"""
     batch_size: int = 256
     """states in an update, of the episodes just played"""
@@ -170,7 +170,8 @@ class SelfImproved(Pupil):
             with torch.inference_mode():
                 scores = self.network(torch.from_numpy(seen[playing])).numpy()
             # The largest of logits and Gumbel noise is a draw from the policy.
-            noise = -np.log(self.rng.standard_exponential(scores.shape, np.float32))
+            chance = self.rng.standard_exponential(scores.shape, np.float32)
+            noise = -np.log(np.maximum(chance, np.finfo(np.float32).tiny))
             noise[playing % args.episodes == 0] = 0.0
             joint = np.zeros(n_rows, np.int64)
             joint[playing] = (scores + noise).argmax(axis=1)

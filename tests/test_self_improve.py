@@ -1,0 +1,158 @@
+"""Self-improvement: what is taught is the shortest of one's own episodes, and it helps."""
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+import torch
+
+from baselines import self_improve
+from baselines.evaluation import evaluate, find_optima, unseen_problems
+from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
+from baselines.policy import NetworkPolicy, load_policy, save_policy
+from baselines.self_improve import Args, SelfImproved
+from baselines.settings import Setting
+from mapp_env import Grid, Problem, replay
+
+GRID = Grid.from_text("....\n.#D.\n..#.\n....")
+SETTING = Setting(GRID, 2, 2, 20)
+SMALL = {
+    "problems": 40,
+    "episodes": 6,
+    "updates_per_round": 8,
+    "batch_size": 32,
+    "kept_batch": 32,
+    "kept_states": 500,
+    "learning_rate": 0.005,
+    "evaluation_problems": 0,
+    "sharpness": 1.0,
+}
+
+
+def untrained(outputs: str = "joint"):
+    """Return a network that has learned nothing."""
+    spec = NetworkSpec("pairs", 2, 2, 4, 16, 32, outputs, dueling=True, code_units=16)
+    return build_network(spec, torch_generator(np.random.SeedSequence(0)))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Return a run folder with an untrained policy."""
+    path = tmp_path / "start"
+    path.mkdir()
+    save_policy(path / "policy.safetensors", untrained())
+    config = {
+        "options": {"n_agents": 2, "n_landmarks": 2, "max_cycles": 20},
+        "grid": GRID.to_text(),
+        "training_problems": [[0, 3]],
+    }
+    (path / "config.json").write_text(json.dumps(config))
+    return path
+
+
+def test_episodes_are_what_the_rules_make_of_them():
+    """Lengths are those of replayed actions; every so-many-th episode is the greedy policy's."""
+    pupil = SelfImproved(Args(**SMALL), SETTING, untrained())
+    drawn = unseen_problems(SETTING, 40)
+    landmarks = np.repeat(drawn, 6, axis=0)
+    observations, joint, lengths = pupil.episodes(landmarks)
+    actions = split_joint(joint, 2, 4)
+    unsolved = lengths > pupil.args.max_length
+    assert 0 < unsolved.sum() < len(lengths)
+    for row in range(len(lengths)):
+        problem = Problem(GRID, landmarks[row].tolist(), 2)
+        played = replay(problem, actions[: min(lengths[row], len(actions)), row])
+        assert played.success == (not unsolved[row])
+        if played.success:
+            assert played.cover_time == lengths[row]
+            assert not observations[lengths[row] :, row].any()
+    with torch.inference_mode():
+        for step, seen in enumerate(observations):
+            going_on = np.flatnonzero((np.arange(len(lengths)) % 6 == 0) & (lengths > step))
+            greedy = pupil.network(torch.from_numpy(seen[going_on])).argmax(1).numpy()
+            np.testing.assert_array_equal(joint[step, going_on], greedy)
+    assert len(np.unique(joint[0, 1:6])) > 1  # the others are drawn
+
+
+def test_the_shortest_episode_is_taught(monkeypatch):
+    """Of equally short ones the greedy one; only what is shorter than the greedy one is kept."""
+    args = Args(**{**SMALL, "problems": 3, "episodes": 3, "max_length": 4})
+    pupil = SelfImproved(args, SETTING, untrained())
+    # Problem 0: all alike; 1: the third is shortest; 2: nobody has solved it.
+    lengths = np.array([2, 2, 2, 4, 3, 1, 5, 5, 5])
+    joint = np.arange(4 * 9).reshape(4, 9) % 16
+    seen = np.repeat(np.arange(36, dtype=np.float32).reshape(4, 9, 1), 6, axis=2)
+    monkeypatch.setattr(pupil, "episodes", lambda landmarks: (seen, joint, lengths))
+    pupil.play()
+    assert pupil.taught.tolist() == [joint[0, 0], joint[0, 5], joint[1, 0]]
+    assert pupil.seen[:, 0].tolist() == [0, 5, 9]
+    assert pupil.n_kept == 1
+    assert pupil.kept_taught[0] == joint[0, 5]
+    assert pupil.kept_seen[0, 0] == 5
+    lengths[:] = 5
+    with pytest.raises(ValueError, match="it solves no problem within max_length"):
+        pupil.play()
+
+
+def test_a_full_memory_forgets_the_oldest():
+    """The newest states are kept, as many as there is room for."""
+    pupil = SelfImproved(Args(**{**SMALL, "kept_states": 5}), SETTING, untrained())
+    for first in (0, 3, 6):
+        numbers = np.arange(first, first + 3)
+        pupil.keep(np.repeat(numbers[:, None], 6, axis=1), numbers)
+    assert sorted(pupil.kept_taught) == [4, 5, 6, 7, 8]
+    assert sorted(pupil.kept_seen[:, 0]) == [4, 5, 6, 7, 8]
+
+
+def test_it_improves(folder, tmp_path):
+    """On a small grid, from an untrained policy, nearly all problems are solved optimally."""
+    args = Args(policy=folder, updates=600, out=tmp_path / "run", **SMALL)
+    problems = unseen_problems(SETTING, 78)
+    optima = find_optima(SETTING, problems)
+    before = evaluate(load_policy(folder), SETTING, problems, optima).summary()
+    assert self_improve.main(args) == 0
+    after = evaluate(load_policy(tmp_path / "run"), SETTING, problems, optima).summary()
+    assert before["optimal %"] < 50
+    assert after["solved %"] > 95
+    assert after["optimal %"] > 85
+
+
+def test_stopped_and_resumed_is_the_same(folder, tmp_path, monkeypatch):
+    """Stopped by SIGTERM and resumed: the same bytes of metrics and weights."""
+    options = {**SMALL, "updates": 150, "policy": folder, "checkpoint_seconds": 1e9}
+    assert self_improve.main(Args(out=tmp_path / "whole", **options)) == 0
+    update, calls = SelfImproved.update, []
+
+    def interrupted(self):
+        calls.append(None)
+        if len(calls) == 61:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return update(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SelfImproved, "update", interrupted)
+        assert self_improve.main(Args(out=tmp_path / "run", **options)) == 143
+    assert self_improve.main(Args(resume=tmp_path / "run")) == 0
+    for name in ("metrics.csv", "policy.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    with pytest.raises(ValueError, match="leave out all others"):
+        self_improve.main(Args(resume=tmp_path / "run", seed=1))
+
+
+def test_what_cannot_be_improved_is_refused():
+    """Values of each agent's actions, and no policy at all: refused by name."""
+    with pytest.raises(ValueError, match="policy must be a meta-agent's with joint values"):
+        SelfImproved(Args(**SMALL), SETTING, untrained("agents"))
+    with pytest.raises(ValueError, match="policy must be the run folder of a trained meta-agent"):
+        self_improve.main(Args())
+
+
+def test_sharpness_changes_no_greedy_action():
+    """Values read as logits: only how likely the other actions are depends on the sharpness."""
+    observations = np.zeros((50, 6), np.float32)
+    observations[:, :4] = np.random.default_rng(0).integers(16, size=(50, 4))
+    before = NetworkPolicy(untrained()).act(observations)
+    pupil = SelfImproved(Args(**{**SMALL, "sharpness": 9.0}), SETTING, untrained())
+    np.testing.assert_array_equal(NetworkPolicy(pupil.network).act(observations), before)
