@@ -2,8 +2,8 @@
 
 Method: self-imitation. Of each random problem several episodes are played at once in the batched
 environment: one greedily, the others with actions drawn from the policy. The shortest is what the
-network is taught, the greedy one if none is shorter; what was found to be shorter is kept and
-taught again for a while. This is reinforcement learning by trial alone: all that is known of a
+network is taught, of equally short ones any, so that the policy stays as undecided between good
+ways as it was; what was shorter than the greedy one is kept and taught again for a while. This is reinforcement learning by trial alone: all that is known of a
 problem is how long one's own episodes on it took, never the optimum, and walls are met by bumping
 into them. In the spirit of self-imitation learning (Oh et al. 2018) and of the classifiers of
 rollout-based policy iteration (Lagoudakis and Parr 2003).
@@ -47,7 +47,7 @@ class Args(Options):
 
     policy: Path | None = None
     """the run folder of a meta-agent with joint values, to start from"""
-    learning_rate: float = 0.002
+    learning_rate: float = 0.001
     """step size of Adam; it falls in a straight line to 0"""
     problems: int = 512
     """random problems that are played at a time"""
@@ -136,14 +136,16 @@ class SelfImproved(Pupil):
         landmarks = np.sort(self.cells[drawn[:, :k]], axis=1)
         observations, actions, lengths = self.episodes(np.repeat(landmarks, args.episodes, axis=0))
         lengths = lengths.reshape(args.problems, args.episodes)
-        best = lengths.argmin(axis=1)  # of equally short ones the first, so the greedy one
-        rows = np.arange(args.problems) * args.episodes + best
         shortest = lengths.min(axis=1)
+        # One of the shortest, each as likely: always the greedy one would leave nothing to explore.
+        chances = self.rng.random(lengths.shape)
+        best = np.where(lengths == shortest[:, None], chances, -1.0).argmax(axis=1)
+        rows = np.arange(args.problems) * args.episodes + best
         steps = np.arange(len(observations))[:, None]
         solved = shortest <= args.max_length
         taken = (steps < shortest) & solved  # (T, problems)
         self.seen, self.taught = observations[:, rows][taken], actions[:, rows][taken]
-        better = taken & (best > 0)
+        better = taken & (shortest < lengths[:, 0])
         self.keep(observations[:, rows][better], actions[:, rows][better])
         if not len(self.seen):
             raise ValueError("policy: it solves no problem within max_length, so nothing is taught")
