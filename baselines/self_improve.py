@@ -3,10 +3,11 @@
 Method: self-imitation. Of each random problem several episodes are played at once in the batched
 environment: one greedily, the others with actions drawn from the policy. The shortest is what the
 network is taught, of equally short ones any, so that the policy stays as undecided between good
-ways as it was; what was shorter than the greedy one is kept and taught again for a while. This is reinforcement learning by trial alone: all that is known of a
-problem is how long one's own episodes on it took, never the optimum, and walls are met by bumping
-into them. In the spirit of self-imitation learning (Oh et al. 2018) and of the classifiers of
-rollout-based policy iteration (Lagoudakis and Parr 2003).
+ways as it was; what was shorter than the greedy one is kept and taught again for a while. This is
+reinforcement learning by trial alone: all that is known of a problem is how long one's own episodes
+on it took, never the optimum, and walls are met by bumping into them. In the spirit of
+self-imitation learning (Oh et al. 2018) and of the classifiers of rollout-based policy iteration
+(Lagoudakis and Parr 2003).
 
 It starts from a policy of ``meta_dqn.py``: the larger its values, the likelier its actions.
 
