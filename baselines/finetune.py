@@ -56,13 +56,13 @@ class Args(solving.Args):
     """most episodes to play"""
     random_episodes: int = 8
     """how many of them walk at random"""
-    imagined: int = 256
+    imagined: int = 4096
     """episodes imagined before each of the others"""
     updates_per_episode: int = 10
     """updates after that"""
     learning_rate: float = 0.002
     """step size of Adam"""
-    patience: int = 6
+    patience: int = 5
     """it ends early when so many of its own episodes have not become shorter"""
     seed: int = 0
     """seed of everything random"""

@@ -1,11 +1,11 @@
 """Improve a trained policy by imitating the best of several of its own episodes.
 
 Method: self-imitation. Of each random problem several episodes are played at once in the batched
-environment: one greedily, the others with actions drawn from the policy. The shortest is what the
-network is taught, of equally short ones any, so that the policy stays as undecided between good
-ways as it was; what was shorter than the greedy one is kept and taught again for a while. This is
-reinforcement learning by trial alone: all that is known of a problem is how long one's own episodes
-on it took, never the optimum, and walls are met by bumping into them. In the spirit of
+environment: one greedily, the others with actions drawn from the policy, just so boldly that they
+become a few per cent longer. The shortest is what the network is taught, the greedy one if none is
+shorter; what was shorter is kept and taught again for a while. This is reinforcement learning by
+trial alone: all that is known of a problem is how long one's own episodes on it took, never the
+optimum, and walls are met by bumping into them. In the spirit of
 self-imitation learning (Oh et al. 2018) and of the classifiers of rollout-based policy iteration
 (Lagoudakis and Parr 2003).
 
@@ -37,6 +37,7 @@ from baselines.settings import Setting, check_fits, read_setting
 from mapp_env import make_vec
 
 ALGORITHM = "self_improve"
+SHARPER = 1.02  # factor from round to round
 
 
 # -- configuration -----------------------------------------------------------------------------
@@ -54,7 +55,7 @@ class Args(Options):
     """random problems that are played at a time"""
     episodes: int = 8
     """episodes of each, the first of them greedy"""
-    updates_per_round: int = 24
+    updates_per_round: int = 16
     """updates after each time"""
     batch_size: int = 256
     """states in an update, of the episodes just played"""
@@ -66,6 +67,8 @@ class Args(Options):
     """steps after which an episode is given up"""
     sharpness: float = 8.0
     """what the values of the policy are multiplied by to be read as logits at the start"""
+    detour: float = 0.03
+    """how much longer the drawn episodes shall be than the greedy ones, on average"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,6 +80,7 @@ class Args(Options):
         check_count("kept_states", self.kept_states, 1, 10_000_000)
         check_count("max_length", self.max_length, 1, 1_000_000)
         check_number("sharpness", self.sharpness, 1e-6, 1e6)
+        check_number("detour", self.detour, 0.0, 10.0)
 
 
 # -- learner -----------------------------------------------------------------------------------
@@ -108,6 +112,7 @@ class SelfImproved(Pupil):
         self.seen = np.zeros((0, size), np.float32)  # states of the episodes just played
         self.taught = np.zeros(0, np.int64)  # the joint action to take in each
         self.left = 0  # updates until the next round
+        self.sharpness = 1.0  # what logits are multiplied by before actions are drawn
         self.kept_seen = np.zeros((args.kept_states, size), np.float32)
         self.kept_taught = np.zeros(args.kept_states, np.int64)
         self.n_kept = 0  # ever; the next goes to row n_kept % kept_states
@@ -138,9 +143,10 @@ class SelfImproved(Pupil):
         observations, actions, lengths = self.episodes(np.repeat(landmarks, args.episodes, axis=0))
         lengths = lengths.reshape(args.problems, args.episodes)
         shortest = lengths.min(axis=1)
-        # One of the shortest, each as likely: always the greedy one would leave nothing to explore.
-        chances = self.rng.random(lengths.shape)
-        best = np.where(lengths == shortest[:, None], chances, -1.0).argmax(axis=1)
+        best = lengths.argmin(axis=1)  # of equally short ones the first, so the greedy one
+        # Taught what it does anyway, the policy becomes ever surer of itself: bolder then.
+        bold = lengths[:, 1:].mean() > (1.0 + args.detour) * lengths[:, 0].mean()
+        self.sharpness *= SHARPER if bold else 1.0 / SHARPER
         rows = np.arange(args.problems) * args.episodes + best
         steps = np.arange(len(observations))[:, None]
         solved = shortest <= args.max_length
@@ -177,7 +183,7 @@ class SelfImproved(Pupil):
             noise = -np.log(np.maximum(chance, np.finfo(np.float32).tiny))
             noise[playing % args.episodes == 0] = 0.0
             joint = np.zeros(n_rows, np.int64)
-            joint[playing] = (scores + noise).argmax(axis=1)
+            joint[playing] = (self.sharpness * scores + noise).argmax(axis=1)
             observations.append(here)
             actions.append(joint)
             commands = split_joint(joint, spec.n_agents, spec.n_actions)
@@ -198,7 +204,12 @@ class SelfImproved(Pupil):
         """Return the episodes just played, and those that are kept."""
         n_rows = min(self.n_kept, self.args.kept_states)
         return {
-            "round": {"seen": self.seen, "taught": self.taught, "left": np.array(self.left)},
+            "round": {
+                "seen": self.seen,
+                "taught": self.taught,
+                "left": np.array(self.left),
+                "sharpness": np.array(self.sharpness),
+            },
             "kept": {
                 "seen": self.kept_seen[:n_rows],
                 "taught": self.kept_taught[:n_rows],
@@ -210,6 +221,7 @@ class SelfImproved(Pupil):
         """Take over what :meth:`own_arrays` returned."""
         self.seen, self.taught = arrays["round.seen"].copy(), arrays["round.taught"].copy()
         self.left, self.n_kept = int(arrays["round.left"]), int(arrays["kept.n"])
+        self.sharpness = float(arrays["round.sharpness"])
         n_rows = len(arrays["kept.seen"])
         self.kept_seen[:n_rows] = arrays["kept.seen"]
         self.kept_taught[:n_rows] = arrays["kept.taught"]
