@@ -2,12 +2,13 @@
 
 Method: self-imitation. Of each random problem several episodes are played at once in the batched
 environment: one greedily, the others with actions drawn from the policy, just so boldly that they
-become a few per cent longer. The shortest is what the network is taught, the greedy one if none is
-shorter; what was shorter is kept and taught again for a while. This is reinforcement learning by
-trial alone: all that is known of a problem is how long one's own episodes on it took, never the
-optimum, and walls are met by bumping into them. In the spirit of
-self-imitation learning (Oh et al. 2018) and of the classifiers of rollout-based policy iteration
-(Lagoudakis and Parr 2003).
+become a few per cent longer. Where one is shorter than the greedy one, it is played again from each
+of its states with other likely actions, to see which of them are as good; those states, with all
+good actions, are kept and taught for a while. Besides, the network is taught to go on as it does
+where nothing shorter was found. This is reinforcement learning by trial alone: all that is known of
+a problem is how long one's own episodes on it took, never the optimum, and walls are met by bumping
+into them. In the spirit of self-imitation learning (Oh et al. 2018) and of rollout-based policy
+iteration by classification (Lagoudakis and Parr 2003).
 
 It starts from a policy of ``meta_dqn.py``: the larger its values, the likelier its actions.
 
@@ -22,16 +23,17 @@ Output: a run folder as of meta_dqn.py (no figures), with a row of metrics.csv p
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
 import tyro
-from torch import Tensor, nn
+from torch import Tensor
 
 from baselines.checks import check_count, check_number
 from baselines.imitation import Options, Pupil, own_options, run_imitation
-from baselines.networks import Network, split_joint
+from baselines.networks import Network, NetworkSpec, split_joint
 from baselines.policy import find_weights, load_policy
 from baselines.settings import Setting, check_fits, read_setting
 from mapp_env import make_vec
@@ -61,7 +63,9 @@ class Args(Options):
     """states in an update, of the episodes just played"""
     kept_batch: int = 256
     """states in an update besides, of episodes that were shorter than the greedy one"""
-    kept_states: int = 60_000
+    alternatives: int = 12
+    """likely joint actions that are tried in each state of a shorter episode"""
+    kept_states: int = 20_000
     """states of such episodes that are kept; the oldest is forgotten first"""
     max_length: int = 16
     """steps after which an episode is given up"""
@@ -77,13 +81,46 @@ class Args(Options):
         check_count("updates_per_round", self.updates_per_round, 1, 65_536)
         check_count("batch_size", self.batch_size, 1, 65_536)
         check_count("kept_batch", self.kept_batch, 0, 65_536)
+        check_count("alternatives", self.alternatives, 1, 1024)
         check_count("kept_states", self.kept_states, 1, 10_000_000)
         check_count("max_length", self.max_length, 1, 1_000_000)
         check_number("sharpness", self.sharpness, 1e-6, 1e6)
         check_number("detour", self.detour, 0.0, 10.0)
 
 
+# -- loss --------------------------------------------------------------------------------------
+
+
+def good_actions_loss(scores: Tensor, good: Tensor) -> Tensor:
+    """Return minus the log-probability of taking a good action, its mean over states.
+
+    Parameters
+    ----------
+    scores
+        (B, A ** N) the network's output, read as logits.
+    good
+        (B, A ** N) bool, which joint actions are good; at least one in each state.
+    """
+    of_good = scores.masked_fill(~good, -torch.inf).logsumexp(1)
+    return (scores.logsumexp(1) - of_good).mean()
+
+
 # -- learner -----------------------------------------------------------------------------------
+
+
+class Lessons(NamedTuple):
+    """States, and what is good in them."""
+
+    seen: np.ndarray  # (B, N + 2K) float32
+    good: np.ndarray  # (B, A ** N) bool, joint actions
+
+    @classmethod
+    def of(cls, size: int, spec: NetworkSpec) -> "Lessons":
+        """Make room for so many."""
+        return cls(
+            np.zeros((size, spec.observation_size), np.float32),
+            np.zeros((size, spec.n_joint_actions), np.bool_),
+        )
 
 
 class SelfImproved(Pupil):
@@ -108,14 +145,12 @@ class SelfImproved(Pupil):
             max_cycles=args.max_length,
         )
         self.envs.reset(seed=args.seed)  # each later problem is given, so nothing of it is random
-        size = self.spec.observation_size
-        self.seen = np.zeros((0, size), np.float32)  # states of the episodes just played
-        self.taught = np.zeros(0, np.int64)  # the joint action to take in each
+        spec = self.spec
+        self.lesson_states = Lessons.of(0, spec)  # of the episodes just played
+        self.kept = Lessons.of(args.kept_states, spec)
+        self.n_kept = 0  # ever; the next goes to row n_kept % kept_states
         self.left = 0  # updates until the next round
         self.sharpness = 1.0  # what logits are multiplied by before actions are drawn
-        self.kept_seen = np.zeros((args.kept_states, size), np.float32)
-        self.kept_taught = np.zeros(args.kept_states, np.int64)
-        self.n_kept = 0  # ever; the next goes to row n_kept % kept_states
 
     def lesson(self) -> Tensor:
         """Return the loss on states of the best episodes; play a new round when it is time."""
@@ -124,15 +159,13 @@ class SelfImproved(Pupil):
             self.play()
             self.left = args.updates_per_round
         self.left -= 1
-        rows = self.rng.integers(len(self.seen), size=args.batch_size)
-        seen, taught = self.seen[rows], self.taught[rows]
+        rows = self.rng.integers(len(self.lesson_states.seen), size=args.batch_size)
+        seen, good = (array[rows] for array in self.lesson_states)
         if self.n_kept:
-            n_rows = min(self.n_kept, args.kept_states)
-            rows = self.rng.integers(n_rows, size=args.kept_batch)
-            seen = np.concatenate((seen, self.kept_seen[rows]))
-            taught = np.concatenate((taught, self.kept_taught[rows]))
-        scores = self.network(torch.from_numpy(seen))
-        return nn.functional.cross_entropy(scores, torch.from_numpy(taught))
+            rows = self.rng.integers(min(self.n_kept, args.kept_states), size=args.kept_batch)
+            seen = np.concatenate((seen, self.kept.seen[rows]))
+            good = np.concatenate((good, self.kept.good[rows]))
+        return good_actions_loss(self.network(torch.from_numpy(seen)), torch.from_numpy(good))
 
     def play(self) -> None:
         """Play new problems, and keep of each the best episode."""
@@ -140,22 +173,72 @@ class SelfImproved(Pupil):
         drawn = self.rng.random((args.problems, len(self.cells))).argpartition(k - 1, axis=1)
         # In the order that the environment gives them in.
         landmarks = np.sort(self.cells[drawn[:, :k]], axis=1)
-        observations, actions, lengths = self.episodes(np.repeat(landmarks, args.episodes, axis=0))
+        observations, joint, lengths = self.episodes(np.repeat(landmarks, args.episodes, axis=0))
         lengths = lengths.reshape(args.problems, args.episodes)
-        shortest = lengths.min(axis=1)
         best = lengths.argmin(axis=1)  # of equally short ones the first, so the greedy one
         # Taught what it does anyway, the policy becomes ever surer of itself: bolder then.
         bold = lengths[:, 1:].mean() > (1.0 + args.detour) * lengths[:, 0].mean()
         self.sharpness *= SHARPER if bold else 1.0 / SHARPER
         rows = np.arange(args.problems) * args.episodes + best
+        observations, joint, shortest = observations[:, rows], joint[:, rows], lengths.min(axis=1)
         steps = np.arange(len(observations))[:, None]
-        solved = shortest <= args.max_length
-        taken = (steps < shortest) & solved  # (T, problems)
-        self.seen, self.taught = observations[:, rows][taken], actions[:, rows][taken]
-        better = taken & (shortest < lengths[:, 0])
-        self.keep(observations[:, rows][better], actions[:, rows][better])
-        if not len(self.seen):
+        taken = (steps < shortest) & (shortest <= args.max_length)  # (T, problems)
+        if not taken.any():
             raise ValueError("policy: it solves no problem within max_length, so nothing is taught")
+        self.lesson_states = Lessons(
+            observations[taken], np.eye(self.spec.n_joint_actions, dtype=np.bool_)[joint[taken]]
+        )
+        shorter = taken & (shortest < lengths[:, 0])
+        if shorter.any():
+            self.keep(self.as_good(landmarks, observations, joint, shortest, shorter))
+
+    def as_good(
+        self,
+        landmarks: np.ndarray,
+        observations: np.ndarray,
+        joint: np.ndarray,
+        lengths: np.ndarray,
+        chosen: np.ndarray,
+    ) -> "Lessons":
+        """Return which likely actions are as good as those taken in some states of episodes.
+
+        Each episode is played again up to the state, then with another action, then greedily.
+
+        Parameters
+        ----------
+        landmarks, observations, joint, lengths
+            (P, K), (T, P, D), (T, P) and (P,): an episode on each problem.
+        chosen
+            (T, P) bool, in which states; the first that the environments have room for.
+        """
+        n_tried = min(self.args.alternatives, self.spec.n_joint_actions)
+        room = self.envs.num_envs // n_tried
+        times, problems = (index[:room] for index in np.nonzero(chosen))
+        seen = observations[times, problems]
+        good = np.zeros((len(seen), self.spec.n_joint_actions), np.bool_)
+        good[np.arange(len(seen)), joint[times, problems]] = True
+        if not len(seen):
+            return Lessons(seen, good)
+        with torch.inference_mode():
+            scores = self.network(torch.from_numpy(seen))
+        tried = scores.topk(n_tried).indices.numpy()
+        # A row for each state and action; those left over play something, and nobody looks.
+        count = len(seen) * n_tried
+        index = np.resize(np.repeat(np.arange(len(seen)), n_tried), self.envs.num_envs)
+        action = np.resize(tried.ravel(), self.envs.num_envs)
+        time, problem = times[index], problems[index]
+        here, _ = self.envs.reset(options={"landmarks": landmarks[problem]})
+        playing = np.arange(self.envs.num_envs) < count
+        for step in range(int(lengths[problems].max())):
+            commands = np.where(step < time, joint[step, problem], action)
+            free = np.flatnonzero(playing & (step > time))
+            with torch.inference_mode():
+                commands[free] = self.network(torch.from_numpy(here[free])).argmax(1).numpy()
+            here, _, terminated, _, _ = self.envs.step(self.split(commands))
+            solved = playing & terminated
+            good[index[solved], action[solved]] = True
+            playing &= ~terminated & (step + 1 < lengths[problem])
+        return Lessons(seen, good)
 
     def episodes(self, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Play an episode on each row of landmarks: every so-many-th greedily.
@@ -167,7 +250,7 @@ class SelfImproved(Pupil):
         lengths
             (rows,) steps until all was visited, ``max_length + 1`` if it was not.
         """
-        args, spec = self.args, self.spec
+        args = self.args
         seen, _ = self.envs.reset(options={"landmarks": landmarks})
         n_rows = len(landmarks)
         playing = np.arange(n_rows)
@@ -186,45 +269,43 @@ class SelfImproved(Pupil):
             joint[playing] = (self.sharpness * scores + noise).argmax(axis=1)
             observations.append(here)
             actions.append(joint)
-            commands = split_joint(joint, spec.n_agents, spec.n_actions)
-            seen, _, terminated, _, _ = self.envs.step(commands)
+            seen, _, terminated, _, _ = self.envs.step(self.split(joint))
             lengths[playing[terminated[playing]]] = step
             playing = playing[~terminated[playing]]
             if not len(playing):
                 break
         return np.stack(observations), np.stack(actions), lengths
 
-    def keep(self, seen: np.ndarray, taught: np.ndarray) -> None:
+    def split(self, joint: np.ndarray) -> np.ndarray:
+        """Return the agents' actions (B, N) of joint ones (B,)."""
+        return split_joint(joint, self.spec.n_agents, self.spec.n_actions)
+
+    def keep(self, lessons: "Lessons") -> None:
         """Keep states of episodes that were shorter than the greedy one."""
-        rows = (self.n_kept + np.arange(len(seen))) % self.args.kept_states
-        self.kept_seen[rows], self.kept_taught[rows] = seen, taught
-        self.n_kept += len(seen)
+        rows = (self.n_kept + np.arange(len(lessons.seen))) % self.args.kept_states
+        self.kept.seen[rows], self.kept.good[rows] = lessons
+        self.n_kept += len(lessons.seen)
 
     def own_arrays(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the episodes just played, and those that are kept."""
         n_rows = min(self.n_kept, self.args.kept_states)
+        kept = Lessons(*(array[:n_rows] for array in self.kept))
         return {
             "round": {
-                "seen": self.seen,
-                "taught": self.taught,
+                **self.lesson_states._asdict(),
                 "left": np.array(self.left),
                 "sharpness": np.array(self.sharpness),
             },
-            "kept": {
-                "seen": self.kept_seen[:n_rows],
-                "taught": self.kept_taught[:n_rows],
-                "n": np.array(self.n_kept),
-            },
+            "kept": {**kept._asdict(), "n": np.array(self.n_kept)},
         }
 
     def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`own_arrays` returned."""
-        self.seen, self.taught = arrays["round.seen"].copy(), arrays["round.taught"].copy()
+        self.lesson_states = Lessons(arrays["round.seen"].copy(), arrays["round.good"].copy())
         self.left, self.n_kept = int(arrays["round.left"]), int(arrays["kept.n"])
         self.sharpness = float(arrays["round.sharpness"])
-        n_rows = len(arrays["kept.seen"])
-        self.kept_seen[:n_rows] = arrays["kept.seen"]
-        self.kept_taught[:n_rows] = arrays["kept.taught"]
+        for array, saved in zip(self.kept, (arrays["kept.seen"], arrays["kept.good"]), strict=True):
+            array[: len(saved)] = saved
 
 
 def main(args: Args) -> int:

@@ -12,9 +12,9 @@ from baselines import self_improve
 from baselines.evaluation import evaluate, find_optima, unseen_problems
 from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
 from baselines.policy import NetworkPolicy, load_policy, save_policy
-from baselines.self_improve import Args, SelfImproved
+from baselines.self_improve import Args, Lessons, SelfImproved
 from baselines.settings import Setting
-from mapp_env import Grid, Problem, replay
+from mapp_env import Grid, Problem, mapp_v0, replay
 
 GRID = Grid.from_text("....\n.#D.\n..#.\n....")
 SETTING = Setting(GRID, 2, 2, 20)
@@ -84,16 +84,75 @@ def test_the_shortest_episode_is_taught(monkeypatch):
     lengths = np.array([2, 2, 2, 4, 3, 1, 5, 5, 5])
     joint = np.arange(4 * 9).reshape(4, 9) % 16
     seen = np.repeat(np.arange(36, dtype=np.float32).reshape(4, 9, 1), 6, axis=2)
+    asked = []
+
+    def as_good(landmarks, observations, joint, lengths, chosen):
+        asked.append(np.argwhere(chosen).tolist())
+        return Lessons(observations[chosen], np.ones((chosen.sum(), 16), bool))
+
     monkeypatch.setattr(pupil, "episodes", lambda landmarks: (seen, joint, lengths))
+    monkeypatch.setattr(pupil, "as_good", as_good)
     pupil.play()
-    assert pupil.taught.tolist() == [joint[0, 0], joint[0, 5], joint[1, 0]]
-    assert pupil.seen[:, 0].tolist() == [0, 5, 9]
+    assert pupil.lesson_states.seen[:, 0].tolist() == [0, 5, 9]
+    assert pupil.lesson_states.good.sum(axis=1).tolist() == [1, 1, 1]
+    taught = pupil.lesson_states.good.argmax(axis=1).tolist()
+    assert taught == [joint[0, 0], joint[0, 5], joint[1, 0]]
+    assert asked == [[[0, 1]]]
     assert pupil.n_kept == 1
-    assert pupil.kept_taught[0] == joint[0, 5]
-    assert pupil.kept_seen[0, 0] == 5
+    assert pupil.kept.seen[0, 0] == 5
     lengths[:] = 5
     with pytest.raises(ValueError, match="it solves no problem within max_length"):
         pupil.play()
+
+
+@pytest.mark.parametrize("alternatives", [1, 7, 16])
+def test_good_actions_are_those_that_are_as_short(alternatives):
+    """Of the likeliest actions just those after which the greedy policy is through in time.
+
+    Found again one by one, through the rules. The action that was taken always counts.
+    """
+    changes = {"problems": 5, "episodes": 40, "alternatives": alternatives}
+    pupil = SelfImproved(Args(**{**SMALL, **changes}), SETTING, untrained())
+    env = mapp_v0.parallel_env(GRID, 2, 2, 20)
+    landmarks = unseen_problems(SETTING, 5)
+    observations, joint, lengths = pupil.episodes(np.repeat(landmarks, 40, axis=0))
+    best = lengths.reshape(5, 40).argmin(axis=1) + 40 * np.arange(5)
+    observations, joint, lengths = observations[:, best], joint[:, best], lengths[best]
+    steps = np.arange(len(joint))[:, None]
+    chosen = (steps < lengths) & (lengths <= pupil.args.max_length)
+    lessons = pupil.as_good(landmarks, observations, joint, lengths, chosen)
+    room = pupil.envs.num_envs // alternatives
+    assert len(lessons.seen) == min(chosen.sum(), room)
+    policy = NetworkPolicy(pupil.network)
+    other = 0
+    for (time, problem), seen, good in zip(np.argwhere(chosen), *lessons, strict=False):
+        np.testing.assert_array_equal(seen, observations[time, problem])
+        assert good[joint[time, problem]]
+        with torch.inference_mode():
+            likely = pupil.network(torch.from_numpy(seen[None]))[0].topk(alternatives).indices
+        for action in range(16):
+            if action == joint[time, problem]:
+                continue
+            commands = [*split_joint(joint[:time, problem], 2, 4), *split_joint([action], 2, 4)]
+            here, _ = env.reset(options={"landmarks": landmarks[problem].tolist()})
+            for step in range(lengths[problem]):
+                if not env.agents:
+                    break
+                if step >= len(commands):
+                    commands.append(policy.act(here["agent_0"][None])[0])
+                chosen_actions = dict(zip(env.agents, commands[step].tolist(), strict=True))
+                here, _, terminated, _, _ = env.step(chosen_actions)
+            as_short = terminated["agent_0"]
+            assert good[action] == (as_short and action in likely.tolist())
+            other += good[action]
+    assert other or alternatives == 1
+
+
+def test_loss_is_the_probability_of_a_good_action():
+    """Minus its logarithm, by hand: two of four actions are good."""
+    scores = torch.log(torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
+    good = torch.tensor([[False, True, False, True]])
+    assert float(self_improve.good_actions_loss(scores, good)) == pytest.approx(-np.log(0.6))
 
 
 @pytest.mark.parametrize(("drawn", "bolder"), [(10, True), (11, True), (12, False)])
@@ -113,9 +172,9 @@ def test_a_full_memory_forgets_the_oldest():
     pupil = SelfImproved(Args(**{**SMALL, "kept_states": 5}), SETTING, untrained())
     for first in (0, 3, 6):
         numbers = np.arange(first, first + 3)
-        pupil.keep(np.repeat(numbers[:, None], 6, axis=1), numbers)
-    assert sorted(pupil.kept_taught) == [4, 5, 6, 7, 8]
-    assert sorted(pupil.kept_seen[:, 0]) == [4, 5, 6, 7, 8]
+        pupil.keep(Lessons(np.repeat(numbers[:, None], 6, axis=1), np.eye(16, dtype=bool)[numbers]))
+    assert sorted(pupil.kept.good.argmax(axis=1)) == [4, 5, 6, 7, 8]
+    assert sorted(pupil.kept.seen[:, 0]) == [4, 5, 6, 7, 8]
 
 
 def test_it_improves(folder, tmp_path):

@@ -4,12 +4,13 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from baselines import finetune, solve
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.policy import NetworkPolicy, save_policy
 from baselines.settings import Setting
-from mapp_env import Plan, make_grid
+from mapp_env import Plan, make_grid, mapp_v0, replay
 from mapp_env.solvers import optimal_costs
 
 GRID = make_grid("random", rows=5, cols=5, seed=1, density=0.1)
@@ -17,10 +18,9 @@ SETTING = Setting(GRID, 2, 2, 20)
 CELLS = tuple(GRID.reachable[[0, -1]].tolist())
 
 
-def untrained(team: str = "one") -> NetworkPolicy:
+def untrained(kind: str = "pairs", outputs: str = "joint", team: str = "one") -> NetworkPolicy:
     """Return a policy that has learned nothing."""
-    outputs = "joint" if team == "one" else "agents"
-    spec = NetworkSpec("pairs", 2, 2, 4, 25, 32, outputs, code_units=16, team=team)
+    spec = NetworkSpec(kind, 2, 2, 4, 25, 32, outputs, code_units=16, team=team)
     return NetworkPolicy(build_network(spec, torch_generator(np.random.SeedSequence(0))))
 
 
@@ -37,15 +37,31 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_fine_tuning_finds_the_optimum():
-    """From an untrained policy, on one problem of a small grid, 30 episodes find the optimum."""
+@pytest.mark.parametrize(
+    ("kind", "outputs", "team"),
+    [
+        ("pairs", "joint", "one"),
+        ("pairs", "agents", "one"),
+        ("paper", "agents", "one"),
+        ("pairs", "agents", "independent"),
+        ("pairs", "agents", "shared"),
+    ],
+)
+def test_fine_tuning_finds_the_optimum(kind, outputs, team):
+    """From an untrained policy of any kind, on a small grid, 30 episodes find the optimum."""
     problem = solve.make_problem(SETTING, CELLS)
-    args = finetune.Args(landmarks=CELLS, updates_per_episode=40, learning_rate=0.008)
-    plan, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
+    args = finetune.Args(
+        landmarks=CELLS, imagined=512, updates_per_episode=5, learning_rate=0.005, patience=30
+    )
+    policy = untrained(kind, outputs, team)
+    before = {name: tensor.clone() for name, tensor in policy.network.state_dict().items()}
+    plan, n_episodes = finetune.finetune(args, policy, SETTING, problem)
     assert n_episodes < 30  # as short as the way to the farthest landmark, so it ends early
     plan.verify(problem)
     assert plan.cover_time == optimal_costs(GRID, [CELLS], 2)[0]
-    again, _ = finetune.finetune(args, untrained(), SETTING, problem)
+    for name, tensor in policy.network.state_dict().items():
+        assert torch.equal(tensor, before[name])  # the policy itself is left as it was
+    again, _ = finetune.finetune(args, policy, SETTING, problem)
     assert again.tours == plan.tours
 
 
@@ -59,11 +75,33 @@ def test_fine_tuning_never_makes_it_worse():
     assert (after.success, after.cover_time) == (before.success, before.cover_time)
 
 
-def test_fine_tuning_is_for_meta_agents():
-    """A policy of independent learners is refused by name."""
+def test_imagined_episodes_are_made_of_experienced_moves():
+    """What is imagined would happen: replayed by the rules it covers all in as many steps.
+
+    With no move known, or none that leads on, nothing is imagined; no unknown move ever is.
+    """
     problem = solve.make_problem(SETTING, CELLS)
-    with pytest.raises(ValueError, match="policy must be a meta-agent's, got one of shared"):
-        finetune.finetune(finetune.Args(landmarks=CELLS), untrained("shared"), SETTING, problem)
+    args = finetune.Args(landmarks=CELLS, imagined=64)
+    tuner = finetune.Tuner(args, untrained().network, problem)
+    assert tuner.imagine() is None
+    rng = np.random.default_rng(0)
+    env = mapp_v0.parallel_env(GRID, 2, 2, 20)
+    for _ in range(3):
+        finetune.play(env, tuner, random=True)
+    known = tuner.moves != finetune.UNKNOWN
+    np.testing.assert_array_equal(tuner.moves[known], np.asarray(GRID.moves)[:, :4][known])
+    for _ in range(20):
+        cell, action = rng.choice(np.argwhere(tuner.moves != finetune.UNKNOWN))
+        tuner.moves[cell, action] = finetune.UNKNOWN  # forgotten
+        found = tuner.imagine()
+        if found is None:
+            continue
+        actions = tuner.digits[found.joint]
+        cells = found.seen[:, :2].astype(int)
+        assert (tuner.moves[cells, actions] != finetune.UNKNOWN).all()
+        played = replay(problem, actions)
+        assert played.success
+        assert played.cover_time == len(actions)
 
 
 def test_solving_from_the_command_line(folder, capsys):
