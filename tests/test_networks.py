@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from baselines.bags import Bag
 from baselines.networks import (
     Head,
     NetworkSpec,
+    arrange,
     build_network,
     greedy_actions,
     split_joint,
@@ -276,3 +278,34 @@ def test_weights_are_counted(changes):
     """What a spec says before anything is allocated is what the network then has."""
     spec = NetworkSpec(**{**SMALL, **changes})
     assert spec.n_weights == sum(tensor.numel() for tensor in build_network(spec).parameters())
+
+
+@pytest.mark.parametrize(("n_bags", "n_each"), [(1, 1), (7, 3), (200, 6)])
+def test_bags_sum_and_pass_gradients_on_like_pytorchs(n_bags, n_each):
+    """Sums and gradients are those of nn.EmbeddingBag, however often a vector is looked up."""
+    rng = np.random.default_rng(n_bags)
+    own = Bag(11, 5, 0.3, torch.Generator().manual_seed(0))
+    other = torch.nn.EmbeddingBag.from_pretrained(own.weight.detach().clone(), mode="sum")
+    other.weight.requires_grad_()
+    indices = torch.from_numpy(rng.integers(11, size=(n_bags, n_each)))
+    torch.testing.assert_close(own(indices), other(indices))
+    weights = torch.from_numpy(rng.normal(size=(n_bags, 5)).astype(np.float32))
+    for bag in (own, other):
+        (bag(indices) ** 2 * weights).sum().backward()
+    torch.testing.assert_close(own.weight.grad, other.weight.grad)
+
+
+@pytest.mark.parametrize("sort", [True, False])
+def test_what_is_looked_up(sort):
+    """By hand: agents in the order of their cells, visited landmarks in the place behind the grid.
+
+    A pair is numbered by the agent's cell and the landmark's; the last pair of each agent is its
+    own cell's.
+    """
+    # Cells 5, 2, 5 of 9; landmarks 3 and 8, the second visited.
+    seen = np.array([[5, 2, 5, 3, 8, 0, 1]], np.float32)
+    pairs, landmarks, order = arrange(seen, 3, 2, 9, sort)
+    assert landmarks.tolist() == [[3, 9]]
+    assert order.tolist() == ([[1, 0, 2]] if sort else [[0, 1, 2]])
+    five, two = [5 * 11 + 3, 5 * 11 + 9, 5 * 11 + 10], [2 * 11 + 3, 2 * 11 + 9, 2 * 11 + 10]
+    assert pairs.tolist() == [[two, five, five] if sort else [five, two, five]]
