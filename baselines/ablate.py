@@ -5,7 +5,7 @@ Command::
     python baselines/ablate.py --out runs/ablation
     python baselines/ablate.py --out runs/ablation --variants "double DQN" --seeds 10
 
-Trains the default preset and every variant of it, one option changed in each, with seeds 0, 1, 2
+Trains the default preset and every variant of it, one component changed in each, with seeds 0, 1, 2
 ..., as many at a time as there are cores, each in a process with one thread. Options that are not
 its own are handed to every training (``--updates-per-episode 10``). The same command goes on where
 it was stopped.
@@ -36,6 +36,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "paper's reward alone": ("--final-reward", "same"),
     "-1 a step alone": ("--final-from", "0"),
     "no wider action gap": ("--action-gap", "0"),
+    "no retries": ("--imagined-retries", "0"),
     "double DQN": ("--double",),
     "no dueling": ("--no-dueling",),
     "constant step size": ("--no-learning-rate-falls",),

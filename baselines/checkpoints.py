@@ -159,3 +159,9 @@ def _canonical(content: Mapping[str, Any]) -> bytes:
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
+
+
+def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """Return the arrays whose names begin with a name and a dot, without these."""
+    start = name + "."
+    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}

@@ -24,13 +24,19 @@ import torch
 import tyro
 from torch import Tensor
 
+from baselines.checkpoints import part
 from baselines.checks import check_count, check_number
 from baselines.exact_values import steps_left
 from baselines.imagined_replay import ImaginedReplay
-from baselines.imitation import Options, Pupil, own_options, run_imitation, stored_grid
+from baselines.imitation import (
+    ImitationOptions,
+    Pupil,
+    good_actions_loss,
+    own_options,
+    run_imitation,
+)
 from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
-from baselines.q_learner import part
-from baselines.settings import N_ACTIONS, Setting, find_grid
+from baselines.settings import N_ACTIONS, Setting, find_grid, read_setting
 from mapp_env import Grid
 
 ALGORITHM = "distill"
@@ -42,7 +48,7 @@ MAX_CELLS = 4096  # of whose distances there is a table
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(ImitationOptions):
     """Options of a distillation."""
 
     grid: str = "paper-7x7"
@@ -83,24 +89,6 @@ class Args(Options):
         check_count("max_length", self.max_length, 1, 1_000_000)
 
 
-# -- loss --------------------------------------------------------------------------------------
-
-
-def optimal_actions_loss(scores: Tensor, steps: np.ndarray) -> Tensor:
-    """Return minus the log-probability of acting optimally, its mean over states.
-
-    Parameters
-    ----------
-    scores
-        (B, A ** N) the network's output, read as logits.
-    steps
-        (B, A ** N) the least steps left after each joint action.
-    """
-    optimal = torch.from_numpy(steps <= steps.min(axis=1, keepdims=True))
-    of_optimal = scores.masked_fill(~optimal, -torch.inf).logsumexp(1)
-    return (scores.logsumexp(1) - of_optimal).mean()
-
-
 # -- learner -----------------------------------------------------------------------------------
 
 
@@ -112,6 +100,7 @@ class Distilled(Pupil):
     def __init__(self, args: Args, grid: Grid) -> None:
         if grid.n_cells > MAX_CELLS:
             raise ValueError(f"grid must have at most {MAX_CELLS:,} cells, got {grid.n_cells:,}")
+        check_count("n_landmarks", args.n_landmarks, 1, grid.reachable.size)
         seeds, states = np.random.SeedSequence(args.seed).spawn(2)
         spec = NetworkSpec(
             kind="pairs",
@@ -154,7 +143,8 @@ class Distilled(Pupil):
         explores = self.rng.random(n_rows) < args.exploration
         joint = np.where(explores, self.rng.integers(n_joint, size=n_rows), joint[:n_rows])
         states.follow(split_joint(joint, n, self.spec.n_actions))
-        return optimal_actions_loss(scores, steps)
+        optimal = torch.from_numpy(steps <= steps.min(axis=1, keepdims=True))
+        return good_actions_loss(scores, optimal)
 
     def own_arrays(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the states, and those that are asked again."""
@@ -168,9 +158,12 @@ class Distilled(Pupil):
 
 def main(args: Args) -> int:
     """Teach and evaluate; return the exit code."""
-    args, config = own_options(args, ALGORITHM)
-    grid = find_grid(args.grid) if config is None else stored_grid(config)
-    setting = Setting(grid, args.n_agents, args.n_landmarks, args.max_cycles)
+    args = own_options(args, ALGORITHM)
+    if args.resume is None:
+        setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
+    else:
+        setting, _ = read_setting(args.resume)
+    grid = setting.grid
     return run_imitation(args, ALGORITHM, setting, lambda: Distilled(args, grid), [])
 
 

@@ -33,10 +33,16 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
 from baselines.checks import check_count, check_number
-from baselines.evaluation import count_unseen, evaluate, find_optima, unseen_problems
+from baselines.evaluation import (
+    MAX_EXACT_LANDMARKS,
+    count_unseen,
+    evaluate,
+    find_optima,
+    unseen_problems,
+)
 from baselines.imagined_replay import UNKNOWN, is_on, join
 from baselines.meta_dqn import joint_values
-from baselines.networks import Network, split_joint
+from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
 from baselines.policy import NetworkPolicy, find_weights
 from baselines.settings import N_ACTIONS, Setting, read_setting
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
@@ -55,7 +61,7 @@ class Args(solving.Args):
     episodes: int = 30
     """most episodes to play"""
     random_episodes: int = 8
-    """how many of them walk at random"""
+    """how many of them, after the first, walk at random"""
     imagined: int = 4096
     """episodes imagined before each of the others"""
     updates_per_episode: int = 10
@@ -70,12 +76,14 @@ class Args(solving.Args):
     def __post_init__(self) -> None:
         check_count("problems", self.problems, 0, 1_000_000)
         check_count("episodes", self.episodes, 1, 30)
-        check_count("random_episodes", self.random_episodes, 0, self.episodes - 1)
+        check_count("random_episodes", self.random_episodes, 0, 29)
         check_count("imagined", self.imagined, 1, 65_536)
         check_count("updates_per_episode", self.updates_per_episode, 1, 10_000)
         check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
         check_count("patience", self.patience, 1, 30)
         check_count("seed", self.seed, 0, 2**63 - 1)
+        if self.problems and (self.landmarks or self.picture or self.plan):
+            raise ValueError("problems takes no landmarks, picture or plan beside it")
 
 
 class Episode(NamedTuple):
@@ -99,6 +107,11 @@ class Tuner:
     """
 
     def __init__(self, args: Args, network: Network, problem: Problem) -> None:
+        if network.spec.n_joint_actions > MAX_JOINT_ACTIONS:
+            raise ValueError(
+                f"policy must be of a team with at most {MAX_JOINT_ACTIONS:,} joint actions, got "
+                f"{network.spec.n_joint_actions:,}"
+            )
         self.args, self.problem = args, problem
         self.network = copy.deepcopy(network)
         self.spec = network.spec
@@ -164,14 +177,12 @@ def finetune(
 ) -> tuple[Plan, int]:
     """Return the best plan of the episodes played, and how many they were.
 
-    It ends early when an episode is as short as the way to the farthest landmark, or nothing has
-    become better for a while.
+    It ends early when nothing has become better for a while.
     """
     tuner = Tuner(args, policy.network, problem)
     env = mapp_v0.parallel_env(
         setting.grid, setting.n_agents, setting.n_landmarks, setting.max_cycles
     )
-    farthest = max(int(setting.grid.home[cell]) for cell in problem.landmarks)
     best: Plan | None = None
     waited = 0
     for episode in range(args.episodes):
@@ -182,7 +193,7 @@ def finetune(
         waited += episode > args.random_episodes
         if best is None or (plan.success, -plan.cover_time) > (best.success, -best.cover_time):
             best, waited = plan, 0
-        if best.success and (best.cover_time <= farthest or waited >= args.patience):
+        if best.success and waited >= args.patience:
             return best, episode + 1
     assert best is not None
     return best, args.episodes
@@ -207,24 +218,40 @@ def play(env: mapp_v0.parallel_env, tuner: Tuner, random: bool) -> Plan:
 
 
 def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[int, ...]]) -> None:
-    """Fine-tune on unseen problems that the policy does not solve optimally, and count."""
+    """Fine-tune on random problems that the policy does not solve optimally, and count.
+
+    Raises
+    ------
+    ValueError
+        If the optimum of so many landmarks is not known.
+    """
     landmarks = unseen_problems(
-        setting, min(100 * args.problems, count_unseen(setting, seen)), seen
+        setting, min(100 * args.problems, count_unseen(setting, seen)), seen, args.seed
     )
-    result = evaluate(policy, setting, landmarks, find_optima(setting, landmarks))
-    chosen = landmarks[~(result.gaps <= 0.0)][: args.problems]
-    optimum = find_optima(setting, chosen)
-    assert optimum is not None
-    seconds, found, gaps = [], 0, []
-    for row, best in zip(tqdm(chosen.tolist(), disable=None), optimum.cover_time, strict=True):
+    optima = find_optima(setting, landmarks)
+    if optima is None:
+        raise ValueError(
+            f"problems: optima are known up to {MAX_EXACT_LANDMARKS} landmarks, the policy is for "
+            f"{setting.n_landmarks}"
+        )
+    result = evaluate(policy, setting, landmarks, optima)
+    rows = np.flatnonzero(~(result.gaps <= 0.0))[: args.problems]
+    if not len(rows):
+        print(f"the policy solves all of {len(landmarks):,} random problems optimally")
+        return
+    seconds, gaps = [], []
+    for row in tqdm(rows, disable=None):
         start = time.perf_counter()
-        plan, _ = finetune(args, policy, setting, solving.make_problem(setting, tuple(row)))
+        problem = solving.make_problem(setting, tuple(landmarks[row].tolist()))
+        plan, _ = finetune(args, policy, setting, problem)
         seconds.append(time.perf_counter() - start)
-        found += plan.cover_time == best
-        gaps.append(plan.cover_time / best - 1)
+        gaps.append(plan.cover_time / optima.cover_time[row] - 1.0)
+    solved = np.isfinite(gaps)
+    found = int((np.array(gaps) == 0.0).sum())
     print(
-        f"{len(chosen)} problems that the policy does not solve optimally: the optimum found on "
-        f"{found} ({100 * found / len(chosen):.1f} %), mean gap {100 * np.mean(gaps):.2f} %, "
+        f"{len(rows)} problems that the policy does not solve optimally, of {len(landmarks):,}: "
+        f"solved {solved.sum()}, the optimum found on {found} ({100 * found / len(rows):.1f} %), "
+        f"mean gap {100 * np.mean(np.array(gaps)[solved]) if solved.any() else np.nan:.2f} %, "
         f"{np.mean(seconds):.1f} s each on average, {max(seconds):.1f} s at most"
     )
 

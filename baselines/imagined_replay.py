@@ -60,7 +60,7 @@ class ImaginedReplay:
     temperature
         Difference of value at which another action is tried e times less.
     exploration
-        Probability that an imagined episode follows one of the other actions.
+        Probability that an imagined episode follows any of the actions tried, not the best.
     from_depot
         Share of the episodes that start at the depot with all landmarks unvisited; the others
         start anywhere, with any number of landmarks left.
@@ -93,7 +93,6 @@ class ImaginedReplay:
         self.landmarks = np.zeros((n_rows, k), np.int64)
         self.visited = np.ones((n_rows, k), np.bool_)
         self.ages = np.full(n_rows, max_length, np.int64)  # of age: started anew when drawn
-        self.problem: np.ndarray | None = None  # (K,) landmarks of all episodes, if not fresh ones
         self.digits = split_joint(np.arange(spec.n_joint_actions), n, spec.n_actions)
 
     def remember(
@@ -106,10 +105,7 @@ class ImaginedReplay:
     @property
     def ready(self) -> bool:
         """Whether enough cells are known to place landmarks."""
-        known = self._known_cells()
-        if self.problem is not None:
-            return bool(np.isin(self.problem, known).all())
-        return len(known) > self.spec.n_landmarks
+        return len(self._known_cells()) >= self.spec.n_landmarks
 
     def _known_cells(self) -> np.ndarray:
         """Return the cells that somebody has moved from, but for the depot."""
@@ -135,8 +131,6 @@ class ImaginedReplay:
         landmarks = known[rng.random((count, len(known))).argpartition(k - 1, axis=1)[:, :k]]
         again = ~solved[ended] & (rng.random(count) < self.retries)
         landmarks[again], at_depot[again] = self.landmarks[ended][again], True
-        if self.problem is not None:
-            landmarks = rng.permuted(np.tile(self.problem, (count, 1)), axis=1)
         left = rng.integers(1, k + 1, size=count)
         # All visited already: such a row starts at the depot as well.
         visited = (np.arange(k) >= left[:, None]) | is_on(cells, landmarks)

@@ -8,7 +8,7 @@ outputs are read as logits, and the greedy policy takes the largest, as it does 
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,13 +18,19 @@ import torch
 from torch import Tensor
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checkpoints import Checkpoints
+from baselines.checkpoints import Checkpoints, part
 from baselines.checks import check_count, check_number
-from baselines.evaluation import evaluate, find_optima, format_table, save_table, unseen_problems
+from baselines.evaluation import (
+    count_unseen,
+    evaluate,
+    find_optima,
+    format_table,
+    save_table,
+    unseen_problems,
+)
 from baselines.networks import Network
 from baselines.optimiser import optimiser_arrays, restore_optimiser
 from baselines.policy import NetworkPolicy, save_policy
-from baselines.q_learner import part
 from baselines.runs import (
     TIMING_FILE,
     WEIGHTS_FILE,
@@ -34,7 +40,6 @@ from baselines.runs import (
     read_config,
 )
 from baselines.settings import Setting
-from mapp_env import Grid
 
 METRICS = ("updates", "loss")
 LOGGED = 100  # updates in a row of metrics.csv
@@ -42,7 +47,7 @@ WARMUP = 200  # updates over which the step size rises to its value
 
 
 @dataclass(frozen=True)
-class Options:
+class ImitationOptions:
     """Options of an imitation."""
 
     seed: int = 0
@@ -84,7 +89,7 @@ class Pupil(ABC):
         Source of everything random.
     """
 
-    def __init__(self, args: Options, network: Network, rng: np.random.Generator) -> None:
+    def __init__(self, args: ImitationOptions, network: Network, rng: np.random.Generator) -> None:
         self.args, self.network, self.rng = args, network, rng
         self.spec = network.spec
         self.optimiser = torch.optim.Adam(self.network.parameters(), fused=True)
@@ -151,13 +156,30 @@ class Pupil(ABC):
         self.losses = list(state["losses"])
 
 
+# -- loss --------------------------------------------------------------------------------------
+
+
+def good_actions_loss(scores: Tensor, good: Tensor) -> Tensor:
+    """Return minus the log-probability of taking a good action, its mean over states.
+
+    Parameters
+    ----------
+    scores
+        (B, A ** N) the network's output, read as logits.
+    good
+        (B, A ** N) bool, which joint actions are good; at least one in each state.
+    """
+    of_good = scores.masked_fill(~good, -torch.inf).logsumexp(1)
+    return (scores.logsumexp(1) - of_good).mean()
+
+
 # -- the run -----------------------------------------------------------------------------------
 
-Chosen = TypeVar("Chosen", bound=Options)
+Chosen = TypeVar("Chosen", bound=ImitationOptions)
 
 
-def own_options(args: Chosen, algorithm: str) -> tuple[Chosen, Mapping[str, Any] | None]:
-    """Return a run's options, and its config if it is resumed.
+def own_options(args: Chosen, algorithm: str) -> Chosen:
+    """Return a run's options: if it is resumed, those it was started with.
 
     Raises
     ------
@@ -165,7 +187,7 @@ def own_options(args: Chosen, algorithm: str) -> tuple[Chosen, Mapping[str, Any]
         If others are given beside ``resume``, or the folder is none of this algorithm's runs.
     """
     if args.resume is None:
-        return args, None
+        return args
     kind = type(args)
     if args != kind(resume=args.resume):
         raise ValueError("resume goes on with the run's own options: leave out all others")
@@ -174,9 +196,11 @@ def own_options(args: Chosen, algorithm: str) -> tuple[Chosen, Mapping[str, Any]
     if config.get("algorithm") != algorithm or not isinstance(options, dict):
         raise ValueError(f"{args.resume}: not a run of {algorithm}")
     names = {field.name for field in fields(kind)}
+    if not names <= options.keys():
+        raise ValueError(f"{args.resume}: its options are not those of this version")
+    own = {name: options[name] for name in names}
     try:
-        own = {name: value for name, value in options.items() if name in names}
-        return kind(**{**own, "out": None, "resume": args.resume}), config
+        return kind(**{**own, "out": None, "resume": args.resume})
     except TypeError as error:
         raise ValueError(f"{args.resume}: {error}") from error
 
@@ -209,7 +233,7 @@ def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopS
 
 
 def run_imitation(
-    args: Options,
+    args: ImitationOptions,
     algorithm: str,
     setting: Setting,
     make_pupil: Callable[[], Pupil],
@@ -231,12 +255,14 @@ def run_imitation(
         Problems that are none of those evaluated.
     """
     torch.set_num_threads(args.threads)
+    # All that can be refused is refused before anything is written.
+    n_evaluated = min(args.evaluation_problems, count_unseen(setting, seen))
     pupil = make_pupil()
     folder = args.resume or args.out or default_folder(algorithm, "default", args.seed)
     task = {name: getattr(setting, name) for name in ("n_agents", "n_landmarks", "max_cycles")}
     identity = {
         "algorithm": algorithm,
-        "options": {**asdict_of(args), **task, "out": None, "resume": None},
+        "options": {**asdict(args), **task, "out": None, "resume": None},
         "grid": setting.grid.to_text(),
         "training_problems": seen,
     }
@@ -245,6 +271,7 @@ def run_imitation(
     try:
         checkpoints = Checkpoints(folder, identity)
         if args.resume is None:
+            save_policy(run.path(WEIGHTS_FILE), pupil.network)  # what it starts from
             run.write_config(identity)
         else:
             go_on(pupil, run, checkpoints)
@@ -253,8 +280,8 @@ def run_imitation(
         if signals.received is not None:
             print(f"stopped early; go on with --resume {folder}", flush=True)
             return 128 + signals.received
-        if args.evaluation_problems:
-            problems = unseen_problems(setting, args.evaluation_problems, seen)
+        if n_evaluated:
+            problems = unseen_problems(setting, n_evaluated, seen)
             policy = NetworkPolicy(pupil.network)
             optima = find_optima(setting, problems)
             table = {"network alone": evaluate(policy, setting, problems, optima)}
@@ -268,24 +295,26 @@ def run_imitation(
     return 0
 
 
-def asdict_of(args: Options) -> dict[str, Any]:
-    """Return options ready for JSON: paths as text."""
-    return {k: str(v) if isinstance(v, Path) else v for k, v in asdict(args).items()}
-
-
 def go_on(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints) -> None:
-    """Bring a training to its newest whole checkpoint, or to its start if there is none."""
+    """Bring a training to its newest whole checkpoint, or to its start if there is none.
+
+    Raises
+    ------
+    ValueError
+        If there are checkpoints but none can be used, or metrics.csv has changed.
+    """
     checkpoint, problems = checkpoints.latest()
     for problem in problems:
         print(f"not used: {problem}")
     if checkpoint is None:
         run.restart()
+        print("no checkpoint had been written: from the start")
         return
-    run.rewind(checkpoint.state["metrics"])
-    pupil.restore(checkpoint.arrays, checkpoint.state)
+    try:
+        run.rewind(checkpoint.state["metrics"])
+        pupil.restore(checkpoint.arrays, checkpoint.state)
+    except (KeyError, TypeError, RuntimeError, IndexError) as error:
+        raise ValueError(
+            f"checkpoint {checkpoint.number} does not fit this run: {error}"
+        ) from error
     print(f"going on from update {pupil.updates + 1:,}")
-
-
-def stored_grid(config: Mapping[str, Any]) -> Grid:
-    """Return the grid in a run's config."""
-    return Grid.from_text(config["grid"])

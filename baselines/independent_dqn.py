@@ -40,6 +40,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from baselines.checkpoints import part
 from baselines.checks import check_flag, check_number
 from baselines.experiment import run_experiment
 from baselines.networks import (
@@ -53,7 +54,7 @@ from baselines.networks import (
 )
 from baselines.options import Options, parse_options
 from baselines.policy import NetworkPolicy
-from baselines.q_learner import QLearner, next_values, part, td_targets
+from baselines.q_learner import QLearner, next_values, td_targets
 from baselines.relabelled_replay import RelabelledReplay
 from baselines.replay_memory import Batch, ReplayMemory
 from baselines.settings import N_ACTIONS

@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from baselines.checks import check_count
 from baselines.experiment import run_experiment
 from baselines.imagined_replay import ImaginedReplay
 from baselines.networks import (
@@ -48,6 +49,7 @@ from baselines.training import Streams
 from mapp_env import Grid
 
 ALGORITHM = "meta_dqn"
+MAX_IMAGINED_AGENTS = 6  # 4,096 joint actions, with values for each in imagined replay
 
 
 # -- configuration -----------------------------------------------------------------------------
@@ -115,6 +117,8 @@ class MetaLearner(QLearner):
         if args.replay == "stored":
             self.memory = ReplayMemory(args.memory_size, self.spec.observation_size, args.n_agents)
         else:
+            # Joint actions are compared, whatever the network's outputs are.
+            check_count("n_agents", args.n_agents, 1, MAX_IMAGINED_AGENTS)
             self.imagined = ImaginedReplay(
                 self.spec,
                 grid.depot,

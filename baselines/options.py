@@ -112,7 +112,7 @@ class Options:
     temperature: float = 0.3
     """difference of value at which another action is tried e times less"""
     imagined_exploration: float = 0.05
-    """probability that an imagined episode follows one of the others"""
+    """probability that an imagined episode follows any of those tried, not the best"""
     imagined_from_depot: float = 0.9
     """share of imagined episodes that start at the depot with all landmarks unvisited"""
     imagined_length: int = 16

@@ -12,10 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from baselines.checkpoints import part
 from baselines.imagined_replay import RelabelledReward, relabelled_reward
 from baselines.networks import Network
 from baselines.optimiser import optimiser_arrays, restore_optimiser
 from baselines.options import Options
+from baselines.policy import MAX_TABLE_CELLS
 from baselines.replay_memory import Batch
 from mapp_env import Grid
 
@@ -25,6 +27,26 @@ class Goal(NamedTuple):
 
     reward: RelabelledReward
     discount: float
+
+
+def make_goals(args: Options, grid: Grid) -> tuple[Goal, ...]:
+    """Return what is aimed at to begin with, and later.
+
+    Raises
+    ------
+    ValueError
+        If the grid has too many cells for a table of distances between all of them.
+    """
+    if grid.n_cells > MAX_TABLE_CELLS:
+        raise ValueError(
+            f"grid must have at most {MAX_TABLE_CELLS:,} cells for replay {args.replay!r}, got "
+            f"{grid.n_cells:,}"
+        )
+    final = args.reward if args.final_reward == "same" else args.final_reward
+    return (
+        Goal(relabelled_reward(grid, args.reward, args.reward_scale), args.discount),
+        Goal(relabelled_reward(grid, final, args.final_reward_scale), args.final_discount),
+    )
 
 
 class Replay(Protocol):
@@ -77,11 +99,7 @@ class QLearner(ABC):
         # is then; all else can be prepared ahead.
         self.ahead = args.replay != "stored" and not args.double
         self.helper = ThreadPoolExecutor(1) if self.ahead and args.prefetch else None
-        final = args.reward if args.final_reward == "same" else args.final_reward
-        self.goals = (
-            Goal(relabelled_reward(grid, args.reward, args.reward_scale), args.discount),
-            Goal(relabelled_reward(grid, final, args.final_reward_scale), args.final_discount),
-        )
+        self.goals = make_goals(args, grid) if args.replay != "stored" else ()
 
     @property
     @abstractmethod
@@ -99,8 +117,7 @@ class QLearner(ABC):
     def goal(self, progress: float) -> Goal:
         """Return what relabelled transitions are rewarded with by now."""
         args = self.args
-        late = args.final_reward != "same" and progress >= args.final_from
-        return self.goals[late and args.replay != "stored"]
+        return self.goals[args.final_reward != "same" and progress >= args.final_from]
 
     def update(self, progress: float) -> float:
         """One step of Adam on the Huber loss of a batch; return the loss.
@@ -231,9 +248,3 @@ def next_values(values: Tensor, chooser: Tensor, known: np.ndarray | None) -> Te
         chooser = chooser.masked_fill(~allowed, -torch.inf)
     best = chooser.argmax(dim=-1, keepdim=True)
     return values.gather(-1, best).squeeze(-1)
-
-
-def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a name and a dot, without these."""
-    start = name + "."
-    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}

@@ -51,7 +51,7 @@ class RelabelledReplay:
     @property
     def ready(self) -> bool:
         """Whether enough cells are known to place landmarks."""
-        return int(self.known.sum()) > self.spec.n_landmarks
+        return int(self.known.sum()) >= self.spec.n_landmarks
 
     def draw(self, n_rows: int, reward: RelabelledReward, rng: np.random.Generator) -> Batch:
         """Return transitions drawn uniformly and with repetition."""

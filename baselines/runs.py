@@ -71,7 +71,7 @@ class RunFolder:
             raise ValueError(f"resume must be a run folder, got {str(folder)!r}")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            occupied = not resume and any(folder.iterdir())
+            occupied = not resume and any(path.name != LOCK_FILE for path in folder.iterdir())
         except OSError as error:
             raise ValueError(f"out must be a folder that can be made: {error}") from error
         if occupied:

@@ -22,7 +22,6 @@ Output: a run folder as of meta_dqn.py (no figures), with a row of metrics.csv p
 
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import gymnasium
@@ -32,7 +31,13 @@ import tyro
 from torch import Tensor
 
 from baselines.checks import check_count, check_number
-from baselines.imitation import Options, Pupil, own_options, run_imitation
+from baselines.imitation import (
+    ImitationOptions,
+    Pupil,
+    good_actions_loss,
+    own_options,
+    run_imitation,
+)
 from baselines.networks import Network, NetworkSpec, split_joint
 from baselines.policy import find_weights, load_policy
 from baselines.settings import Setting, check_fits, read_setting
@@ -46,11 +51,11 @@ SHARPER = 1.02  # factor from round to round
 
 
 @dataclass(frozen=True)
-class Args(Options):
+class Args(ImitationOptions):
     """Options of a self-improvement."""
 
-    policy: Path | None = None
-    """the run folder of a meta-agent with joint values, to start from"""
+    policy: str | None = None
+    """a meta-agent with joint values to start from: a run folder, or a pretrained policy's name"""
     learning_rate: float = 0.001
     """step size of Adam; it falls in a straight line to 0"""
     problems: int = 512
@@ -88,23 +93,6 @@ class Args(Options):
         check_number("detour", self.detour, 0.0, 10.0)
 
 
-# -- loss --------------------------------------------------------------------------------------
-
-
-def good_actions_loss(scores: Tensor, good: Tensor) -> Tensor:
-    """Return minus the log-probability of taking a good action, its mean over states.
-
-    Parameters
-    ----------
-    scores
-        (B, A ** N) the network's output, read as logits.
-    good
-        (B, A ** N) bool, which joint actions are good; at least one in each state.
-    """
-    of_good = scores.masked_fill(~good, -torch.inf).logsumexp(1)
-    return (scores.logsumexp(1) - of_good).mean()
-
-
 # -- learner -----------------------------------------------------------------------------------
 
 
@@ -131,10 +119,8 @@ class SelfImproved(Pupil):
     def __init__(self, args: Args, setting: Setting, network: Network) -> None:
         if network.spec.outputs != "joint":
             raise ValueError("policy must be a meta-agent's with joint values (--outputs joint)")
+        check_count("alternatives", args.alternatives, 1, args.problems * args.episodes)
         super().__init__(args, network, np.random.default_rng(args.seed))
-        with torch.no_grad():
-            for weights in network.head.parameters():
-                weights.mul_(args.sharpness)
         self.cells = setting.grid.reachable
         self.envs = make_vec(
             args.problems * args.episodes,
@@ -308,17 +294,29 @@ class SelfImproved(Pupil):
             array[: len(saved)] = saved
 
 
+def sharpen(network: Network, factor: float) -> None:
+    """Multiply all outputs of a network: its greedy actions stay the same."""
+    with torch.no_grad():
+        for weights in network.head.parameters():
+            weights.mul_(factor)
+
+
 def main(args: Args) -> int:
     """Improve and evaluate; return the exit code."""
-    args, _ = own_options(args, ALGORITHM)
-    if args.policy is None:
+    args = own_options(args, ALGORITHM)
+    # A resumed run has what it started from in its own folder, until it has something better.
+    start = args.policy if args.resume is None else args.resume
+    if start is None:
         raise ValueError("policy must be the run folder of a trained meta-agent, got none")
-    trained = load_policy(args.policy)
-    folder = find_weights(args.policy).parent
+    trained = load_policy(start)
+    folder = find_weights(start).parent
     setting, seen = read_setting(folder)
     check_fits(trained.spec, setting, folder)
+    network = trained.network
+    if args.resume is None:
+        sharpen(network, args.sharpness)
     return run_imitation(
-        args, ALGORITHM, setting, lambda: SelfImproved(args, setting, trained.network), seen
+        args, ALGORITHM, setting, lambda: SelfImproved(args, setting, network), seen
     )
 
 

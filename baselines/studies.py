@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from filelock import FileLock, Timeout
 from scipy import stats
 from tqdm import tqdm  # type: ignore[import-untyped]
 
@@ -105,12 +106,12 @@ def plan_trial(
     ValueError
         If an option is refused, or its folder holds a training with other options.
     """
+    set_here = {*OWN_ENTRIES, *map(option_name, own)}
     for word in words:
-        name = word.partition("=")[0].removeprefix("--").replace("-", "_").removeprefix("no_")
-        if word.startswith("--") and name in OWN_ENTRIES:
+        if word.startswith("--") and option_name(word) in set_here:
             raise ValueError(f"{word}: set for each training by the study itself")
-    # With a process for each core a second thread gains nothing. Its own words come last, and win.
-    all_words = ("--seed", str(seed), "--no-prefetch", *words, *own)
+    # With a process for each core a second thread gains nothing.
+    all_words = ("--seed", str(seed), "--no-prefetch", *own, *words)
     options = parse_options(kind[1], "", all_words)
     if not options.evaluation_problems:
         raise ValueError("evaluation_problems must be at least 1 to compare, got 0")
@@ -118,6 +119,11 @@ def plan_trial(
     trial = Trial(group, seed, out / name, kind[0], options, all_words)
     check_folder(trial)
     return trial
+
+
+def option_name(word: str) -> str:
+    """Return the name of the option that a word of a command line sets."""
+    return word.partition("=")[0].removeprefix("--").replace("-", "_").removeprefix("no_")
 
 
 def check_folder(trial: Trial) -> None:
@@ -146,12 +152,17 @@ def check_folder(trial: Trial) -> None:
                 "differ; use another folder"
             )
         return
-    for path in list(folder.iterdir()):
-        # Killed before its config was written.
-        own = path.name in (METRICS_FILE, LOCK_FILE) or path.name.startswith(f".{CONFIG_FILE}.")
-        if not own:
-            raise ValueError(f"out: {folder} holds something else: {path.name}")
-        path.unlink()
+    try:
+        with FileLock(folder / LOCK_FILE, timeout=0):
+            for path in list(folder.iterdir()):
+                # Killed before its config was written.
+                own = path.name == METRICS_FILE or path.name.startswith(f".{CONFIG_FILE}.")
+                if own:
+                    path.unlink()
+                elif path.name != LOCK_FILE:
+                    raise ValueError(f"out: {folder} holds something else: {path.name}")
+    except Timeout:
+        raise ValueError(f"out: another training is writing into {folder}") from None
 
 
 def train_all(trials: Iterable[Trial], jobs: int, signals: StopSignals) -> list[str]:

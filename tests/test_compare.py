@@ -8,6 +8,7 @@ import signal
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 from scipy import stats
 
 from baselines import compare, experiment, independent_dqn, meta_dqn, studies
@@ -130,6 +131,9 @@ def test_other_options_are_not_compared_with_these(compared):
         compare.main(tiny(compared), words)
     with pytest.raises(ValueError, match="set for each training"):
         compare.main(tiny(compared), ["--seed", "3"])
+    default = tiny(compared, presets=("default",))
+    with pytest.raises(ValueError, match="--updates-per-episode: set for each training"):
+        compare.main(default, ["--updates-per-episode", "3"])
     with pytest.raises(ValueError, match="evaluation_problems must be at least 1"):
         compare.main(tiny(compared), [*WORDS, "--evaluation-problems", "0"])
 
@@ -142,6 +146,24 @@ def test_what_is_no_run_is_left_alone(tmp_path):
     with pytest.raises(ValueError, match=r"holds something else: thesis\.tex"):
         compare.main(tiny(tmp_path), WORDS)
     assert (other / "thesis.tex").read_text() == "years of work"
+
+
+def test_what_another_is_about_to_train_is_left_alone(tmp_path):
+    """A folder whose lock is held is not cleared, however little is in it so far."""
+    begun = tmp_path / "paper-meta-seed0"
+    begun.mkdir()
+    (begun / "metrics.csv").write_text("episode\n")
+    with FileLock(begun / ".lock"), pytest.raises(ValueError, match="another training is writing"):
+        compare.main(tiny(tmp_path), WORDS)
+    assert (begun / "metrics.csv").exists()
+
+
+def test_updates_of_the_default_preset_can_be_fewer(tmp_path):
+    """They are set for that preset alone."""
+    args = tiny(tmp_path, presets=("default", "paper"), default_updates=7)
+    trials = compare.plan_trials(args, [])
+    updates = {trial.group[0]: trial.options.updates_per_episode for trial in trials}
+    assert updates == {"default": 7, "paper": 0}
 
 
 def test_failed_training_is_reported(tmp_path):

@@ -67,11 +67,51 @@ def test_labels_are_consistent_along_any_walk(n_agents, n_landmarks):
         np.testing.assert_array_equal(steps[:, joint], np.where(seen.all(axis=1), 0, left))
 
 
-def test_loss_is_the_probability_of_acting_optimally():
-    """Minus its logarithm, by hand: two of four actions are optimal."""
-    scores = torch.log(torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
-    loss = distill.optimal_actions_loss(scores, np.array([[5, 4, 6, 4]]))
-    assert float(loss) == pytest.approx(-np.log(0.6))
+def test_wrong_answers_are_asked_again_until_they_are_right():
+    """Just the states whose greedy action is not optimal wait, the oldest first, and come next."""
+    args = distill.Args(**{**SMALL, "asked_again": 5})
+    pupil = distill.Distilled(args, make_grid())
+    tables_of = tables(make_grid())
+
+    def wrong(seen: np.ndarray) -> np.ndarray:
+        cells, landmarks, flags = np.split(seen.astype(np.int64), (2, 4), axis=1)
+        steps = steps_left(cells, landmarks, flags > 0, *tables_of)
+        with torch.inference_mode():
+            best = pupil.network(torch.from_numpy(seen)).argmax(1).numpy()
+        return steps[np.arange(len(seen)), best] > steps.min(axis=1)
+
+    for _ in range(5):
+        waiting = pupil.mistakes.copy()
+        pupil.lesson()  # and no step, so the network stays as it is
+        stays = waiting[:5][wrong(waiting[:5])] if len(waiting) else waiting
+        kept = len(waiting) - len(waiting[:5])
+        np.testing.assert_array_equal(pupil.mistakes[:kept], waiting[5:])
+        assert wrong(pupil.mistakes).all()
+        assert len(pupil.mistakes) >= kept + len(stays)
+    assert len(pupil.mistakes) > 50
+    for array in pupil.own_arrays()["mistakes"].values():
+        assert len(array) == len(pupil.mistakes)
+
+
+@pytest.mark.parametrize("changes", [{"n_landmarks": 3}, {"n_landmarks": 2, "n_agents": 6}])
+def test_what_cannot_be_taught_is_refused(changes, tmp_path):
+    """More landmarks than there are cells for, or too many joint actions: before any folder."""
+    (tmp_path / "grid.txt").write_text(".D.")
+    args = distill.Args(
+        grid=str(tmp_path / "grid.txt"), out=tmp_path / "run", **{**SMALL, **changes}
+    )
+    with pytest.raises(ValueError, match=r"n_landmarks must be|outputs must be"):
+        distill.main(args)
+    assert not (tmp_path / "run").exists()
+
+
+def test_few_problems_are_all_evaluated(tmp_path):
+    """Where there are fewer problems than are asked for, the table is over all of them."""
+    (tmp_path / "grid.txt").write_text("..D..")
+    options = {**SMALL, "updates": 3, "evaluation_problems": 1000}
+    args = distill.Args(grid=str(tmp_path / "grid.txt"), out=tmp_path / "run", **options)
+    assert distill.main(args) == 0
+    assert "network alone,6," in (tmp_path / "run" / "evaluation.csv").read_text()
 
 
 def test_pupil_learns_the_optimum(tmp_path):

@@ -182,10 +182,10 @@ def test_moves_are_remembered_agent_by_agent():
 
 
 def test_ready_only_with_room_for_the_landmarks():
-    """There must be one more cell that somebody has left, the depot aside, than landmarks."""
+    """There must be as many cells that somebody has left, the depot aside, as landmarks."""
     grid = GRIDS["corridor"]
     replay = make_replay(grid, 1, 2)
-    for cell, ready in ((3, False), (2, False), (4, False), (5, True)):
+    for cell, ready in ((3, False), (2, False), (4, True), (5, True)):
         replay.remember(
             np.array([cell, 0, 0, 0, 0], np.float32),
             np.array([2]),

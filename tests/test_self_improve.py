@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import self_improve
+from baselines import imitation, self_improve
 from baselines.evaluation import evaluate, find_optima, unseen_problems
 from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
 from baselines.policy import NetworkPolicy, load_policy, save_policy
@@ -28,6 +28,7 @@ SMALL = {
     "learning_rate": 0.005,
     "evaluation_problems": 0,
     "sharpness": 1.0,
+    "alternatives": 4,
 }
 
 
@@ -152,7 +153,7 @@ def test_loss_is_the_probability_of_a_good_action():
     """Minus its logarithm, by hand: two of four actions are good."""
     scores = torch.log(torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
     good = torch.tensor([[False, True, False, True]])
-    assert float(self_improve.good_actions_loss(scores, good)) == pytest.approx(-np.log(0.6))
+    assert float(imitation.good_actions_loss(scores, good)) == pytest.approx(-np.log(0.6))
 
 
 @pytest.mark.parametrize(("drawn", "bolder"), [(10, True), (11, True), (12, False)])
@@ -224,6 +225,32 @@ def test_sharpness_changes_no_greedy_action():
     """Values read as logits: only how likely the other actions are depends on the sharpness."""
     observations = np.zeros((50, 6), np.float32)
     observations[:, :4] = np.random.default_rng(0).integers(16, size=(50, 4))
-    before = NetworkPolicy(untrained()).act(observations)
-    pupil = SelfImproved(Args(**{**SMALL, "sharpness": 9.0}), SETTING, untrained())
-    np.testing.assert_array_equal(NetworkPolicy(pupil.network).act(observations), before)
+    network = untrained()
+    before = NetworkPolicy(network).act(observations)
+    with torch.no_grad():
+        values = network(torch.from_numpy(observations))
+        self_improve.sharpen(network, 9.0)
+        torch.testing.assert_close(network(torch.from_numpy(observations)), 9.0 * values)
+    np.testing.assert_array_equal(NetworkPolicy(network).act(observations), before)
+
+
+def test_a_run_needs_nothing_but_its_folder(folder, tmp_path, monkeypatch):
+    """Killed before its first checkpoint, its start gone: it begins again from its own copy."""
+    options = {**SMALL, "updates": 20, "policy": str(folder), "sharpness": 3.0}
+    assert self_improve.main(Args(out=tmp_path / "whole", **options)) == 0
+
+    def killed(*arguments):
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(imitation, "train", killed)
+        with pytest.raises(ZeroDivisionError):
+            self_improve.main(Args(out=tmp_path / "run", **options))
+    for path in folder.iterdir():
+        path.unlink()
+    assert self_improve.main(Args(resume=tmp_path / "run")) == 0
+    for name in ("metrics.csv", "policy.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    (tmp_path / "run" / "checkpoints" / "000000000020.safetensors").write_bytes(b"damaged")
+    with pytest.raises(ValueError, match="checkpoint"):
+        self_improve.main(Args(resume=tmp_path / "run"))

@@ -1,11 +1,14 @@
 """A policy's routes for one problem, before and after a short training on it."""
 
 import json
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+import mapp_env
 from baselines import finetune, solve
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.policy import NetworkPolicy, save_policy
@@ -51,12 +54,12 @@ def test_fine_tuning_finds_the_optimum(kind, outputs, team):
     """From an untrained policy of any kind, on a small grid, 30 episodes find the optimum."""
     problem = solve.make_problem(SETTING, CELLS)
     args = finetune.Args(
-        landmarks=CELLS, imagined=512, updates_per_episode=5, learning_rate=0.005, patience=30
+        landmarks=CELLS, imagined=512, updates_per_episode=5, learning_rate=0.005, patience=12
     )
     policy = untrained(kind, outputs, team)
     before = {name: tensor.clone() for name, tensor in policy.network.state_dict().items()}
     plan, n_episodes = finetune.finetune(args, policy, SETTING, problem)
-    assert n_episodes < 30  # as short as the way to the farthest landmark, so it ends early
+    assert n_episodes <= 30
     plan.verify(problem)
     assert plan.cover_time == optimal_costs(GRID, [CELLS], 2)[0]
     for name, tensor in policy.network.state_dict().items():
@@ -69,10 +72,66 @@ def test_fine_tuning_never_makes_it_worse():
     """The policy's own episode is one of those played, so what counts is at least as good."""
     problem = solve.make_problem(SETTING, CELLS)
     before = solve.solve_by_policy(untrained(), SETTING, problem)
-    args = finetune.Args(landmarks=CELLS, episodes=1, random_episodes=0)
+    args = finetune.Args(landmarks=CELLS, episodes=1, imagined=16)
     after, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
     assert n_episodes == 1
     assert (after.success, after.cover_time) == (before.success, before.cover_time)
+
+
+def test_the_best_episode_counts_and_waiting_ends(monkeypatch):
+    """Not the last episode but the best; over when its own have not become shorter for a while."""
+    problem = solve.make_problem(SETTING, CELLS)
+    optimum = mapp_env.solve(problem)
+    longer = [replace(optimum, cover_time=optimum.cover_time + n) for n in range(9)]
+    # The policy's own, two at random, then those after training.
+    plans = iter([longer[8], longer[8], longer[5], longer[6], longer[3], longer[4], longer[7]])
+    monkeypatch.setattr(finetune, "play", lambda env, tuner, random: next(plans))
+    monkeypatch.setattr(finetune.Tuner, "train", lambda tuner: None)
+    args = finetune.Args(landmarks=CELLS, random_episodes=2, patience=2)
+    best, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
+    assert (best.cover_time, n_episodes) == (longer[3].cover_time, 7)
+
+
+def test_fine_tuning_from_the_command_line(folder, capsys):
+    """One problem beside its optimum; several, of which it is counted how many became optimal."""
+    short = {"imagined": 64, "updates_per_episode": 2, "policy": str(folder)}
+    plan = folder / "plan.json"
+    status = finetune.main(finetune.Args(landmarks=CELLS, plan=plan, **short))
+    assert status == (0 if Plan.load(plan).success else 1)
+    printed = capsys.readouterr().out
+    assert f"optimum: cover time {optimal_costs(GRID, [CELLS], 2)[0]}" in printed
+    assert "fine-tuned:" in printed
+    assert finetune.main(finetune.Args(problems=2, **short)) == 0
+    found = re.search(r"^2 problems .* found on (\d) \(", capsys.readouterr().out, re.MULTILINE)
+    assert found is not None
+    assert 0 <= int(found[1]) <= 2
+
+
+def test_nothing_to_fine_tune_is_said(folder, monkeypatch, capsys):
+    """A policy that solves all optimally: said so, and no error."""
+    evaluate = finetune.evaluate
+
+    def optimal(policy, setting, landmarks, optima):
+        return replace(
+            evaluate(policy, setting, landmarks, optima),
+            success=np.ones(len(landmarks), bool),
+            cover_time=optima.cover_time.astype(float),
+        )
+
+    monkeypatch.setattr(finetune, "evaluate", optimal)
+    assert finetune.main(finetune.Args(problems=1, policy=str(folder))) == 0
+    assert "solves all of" in capsys.readouterr().out
+
+
+def test_what_cannot_be_fine_tuned_is_refused(folder):
+    """Landmarks beside a number of problems, and a team of too many joint actions."""
+    with pytest.raises(ValueError, match="problems takes no landmarks"):
+        finetune.Args(landmarks=CELLS, problems=2)
+    spec = NetworkSpec("paper", 7, 2, 4, 25, 8)
+    large = NetworkPolicy(build_network(spec, torch_generator(np.random.SeedSequence(0))))
+    problem = mapp_env.Problem(GRID, CELLS, 7)
+    with pytest.raises(ValueError, match=r"policy must be of a team with at most 1,024 joint"):
+        finetune.finetune(finetune.Args(landmarks=CELLS), large, Setting(GRID, 7, 2, 20), problem)
 
 
 def test_imagined_episodes_are_made_of_experienced_moves():
