@@ -209,14 +209,15 @@ class AgentLearner(QLearner):
     def prepare(self, progress: float) -> tuple[Batch, Tensor]:
         """Return a batch and the targets of its values."""
         args = self.args
-        goal = self.goal(progress)
         with torch.no_grad():
             if self.memory is not None:
-                batch, scale = self.memory.sample(args.batch_size, self.rng), args.reward_scale
+                batch = self.memory.sample(args.batch_size, self.rng)
+                scale, discount = args.reward_scale, args.discount
             else:
                 assert self.relabelled is not None
+                goal = self.goal(progress)
                 batch = self.relabelled.draw(args.batch_size, goal.reward, self.rng)
-                scale = 1.0  # already in the reward
+                scale, discount = 1.0, goal.discount  # already in the reward
             seen = torch.from_numpy(batch.next_observations[:, 0])
             values = self.target(seen)[:, 0]
             chooser = self.network(seen)[:, 0] if args.double else values
@@ -230,7 +231,7 @@ class AgentLearner(QLearner):
                 scale * torch.from_numpy(batch.rewards[:, 0]),
                 torch.from_numpy(batch.terminated[:, 0]),
                 following,
-                goal.discount,
+                discount,
             ).view(*batch.rewards.shape)
             if args.action_gap and self.relabelled is not None:
                 here = self.target(torch.from_numpy(batch.observations))

@@ -4,11 +4,13 @@ Method: self-imitation. Of each random problem several episodes are played at on
 environment: one greedily, the others with actions drawn from the policy, just so boldly that they
 become a few per cent longer. Where one is shorter than the greedy one, it is played again from each
 of its states with other likely actions, to see which of them are as good; those states, with all
-good actions, are kept and taught for a while. Besides, the network is taught to go on as it does
-where nothing shorter was found. This is reinforcement learning by trial alone: all that is known of
-a problem is how long one's own episodes on it took, never the optimum, and walls are met by bumping
-into them. In the spirit of self-imitation learning (Oh et al. 2018) and of rollout-based policy
-iteration by classification (Lagoudakis and Parr 2003).
+good actions, are kept and taught for a while, and the problem comes again until the greedy episode
+is as short. Besides, the network is taught to go on as it does where nothing shorter was found.
+This is reinforcement learning by trial alone: all that is known of a problem is how long one's own
+episodes on it took, never the optimum, and walls are met by bumping into them. In the spirit of
+self-imitation learning (Oh et al. 2018) and of rollout-based policy iteration by classification
+(Lagoudakis and Parr 2003). As many problems are played as updates allow: on a small grid, in the
+end, nearly all there are.
 
 It starts from a policy of ``meta_dqn.py``: the larger its values, the likelier its actions.
 
@@ -44,6 +46,7 @@ from baselines.settings import Setting, check_fits, read_setting
 from mapp_env import make_vec
 
 ALGORITHM = "self_improve"
+MAX_AGAIN = 4096  # problems that wait to be played again; the oldest is forgotten
 SHARPER = 1.02  # factor from round to round
 
 
@@ -60,6 +63,8 @@ class Args(ImitationOptions):
     """step size of Adam; it falls in a straight line to 0"""
     problems: int = 512
     """random problems that are played at a time"""
+    played_again: int = 128
+    """at most so many of them are problems on which the greedy episode was not the shortest"""
     episodes: int = 8
     """episodes of each, the first of them greedy"""
     updates_per_round: int = 16
@@ -82,6 +87,7 @@ class Args(ImitationOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("problems", self.problems, 1, 65_536)
+        check_count("played_again", self.played_again, 0, self.problems)
         check_count("episodes", self.episodes, 2, 1024)
         check_count("updates_per_round", self.updates_per_round, 1, 65_536)
         check_count("batch_size", self.batch_size, 1, 65_536)
@@ -135,6 +141,7 @@ class SelfImproved(Pupil):
         self.lesson_states = Lessons.of(0, spec)  # of the episodes just played
         self.kept = Lessons.of(args.kept_states, spec)
         self.n_kept = 0  # ever; the next goes to row n_kept % kept_states
+        self.again = np.zeros((0, spec.n_landmarks), np.int64)  # to be played again
         self.left = 0  # updates until the next round
         self.sharpness = 1.0  # what logits are multiplied by before actions are drawn
 
@@ -159,6 +166,8 @@ class SelfImproved(Pupil):
         drawn = self.rng.random((args.problems, len(self.cells))).argpartition(k - 1, axis=1)
         # In the order that the environment gives them in.
         landmarks = np.sort(self.cells[drawn[:, :k]], axis=1)
+        again = self.again[: args.played_again]
+        landmarks[: len(again)] = again
         observations, joint, lengths = self.episodes(np.repeat(landmarks, args.episodes, axis=0))
         lengths = lengths.reshape(args.problems, args.episodes)
         best = lengths.argmin(axis=1)  # of equally short ones the first, so the greedy one
@@ -168,13 +177,16 @@ class SelfImproved(Pupil):
         rows = np.arange(args.problems) * args.episodes + best
         observations, joint, shortest = observations[:, rows], joint[:, rows], lengths.min(axis=1)
         steps = np.arange(len(observations))[:, None]
+        better = (shortest < lengths[:, 0]) | (lengths[:, 0] > args.max_length)
+        left = np.concatenate((self.again[len(again) :], landmarks[better]))
+        self.again = left[-MAX_AGAIN:] if args.played_again else left[:0]
         taken = (steps < shortest) & (shortest <= args.max_length)  # (T, problems)
         if not taken.any():
             raise ValueError("policy: it solves no problem within max_length, so nothing is taught")
         self.lesson_states = Lessons(
             observations[taken], np.eye(self.spec.n_joint_actions, dtype=np.bool_)[joint[taken]]
         )
-        shorter = taken & (shortest < lengths[:, 0])
+        shorter = taken & better
         if shorter.any():
             self.keep(self.as_good(landmarks, observations, joint, shortest, shorter))
 
@@ -279,6 +291,7 @@ class SelfImproved(Pupil):
         return {
             "round": {
                 **self.lesson_states._asdict(),
+                "again": self.again,
                 "left": np.array(self.left),
                 "sharpness": np.array(self.sharpness),
             },
@@ -288,6 +301,7 @@ class SelfImproved(Pupil):
     def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`own_arrays` returned."""
         self.lesson_states = Lessons(arrays["round.seen"].copy(), arrays["round.good"].copy())
+        self.again = arrays["round.again"].copy()
         self.left, self.n_kept = int(arrays["round.left"]), int(arrays["kept.n"])
         self.sharpness = float(arrays["round.sharpness"])
         for array, saved in zip(self.kept, (arrays["kept.seen"], arrays["kept.good"]), strict=True):

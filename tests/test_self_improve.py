@@ -20,6 +20,7 @@ GRID = Grid.from_text("....\n.#D.\n..#.\n....")
 SETTING = Setting(GRID, 2, 2, 20)
 SMALL = {
     "problems": 40,
+    "played_again": 10,
     "episodes": 6,
     "updates_per_round": 8,
     "batch_size": 32,
@@ -79,7 +80,7 @@ def test_episodes_are_what_the_rules_make_of_them():
 
 def test_the_shortest_episode_is_taught(monkeypatch):
     """Of equally short ones the greedy one; only what is shorter than the greedy one is kept."""
-    args = Args(**{**SMALL, "problems": 3, "episodes": 3, "max_length": 4})
+    args = Args(**{**SMALL, "problems": 3, "episodes": 3, "max_length": 4, "played_again": 1})
     pupil = SelfImproved(args, SETTING, untrained())
     # Problem 0: all alike; 1: the third is shortest; 2: nobody has solved it.
     lengths = np.array([2, 2, 2, 4, 3, 1, 5, 5, 5])
@@ -101,6 +102,8 @@ def test_the_shortest_episode_is_taught(monkeypatch):
     assert asked == [[[0, 1]]]
     assert pupil.n_kept == 1
     assert pupil.kept.seen[0, 0] == 5
+    # The one that nobody has solved comes again as well.
+    assert len(pupil.again) == 2
     lengths[:] = 5
     with pytest.raises(ValueError, match="it solves no problem within max_length"):
         pupil.play()
@@ -112,7 +115,7 @@ def test_good_actions_are_those_that_are_as_short(alternatives):
 
     Found again one by one, through the rules. The action that was taken always counts.
     """
-    changes = {"problems": 5, "episodes": 40, "alternatives": alternatives}
+    changes = {"problems": 5, "episodes": 40, "alternatives": alternatives, "played_again": 5}
     pupil = SelfImproved(Args(**{**SMALL, **changes}), SETTING, untrained())
     env = mapp_v0.parallel_env(GRID, 2, 2, 20)
     landmarks = unseen_problems(SETTING, 5)
@@ -159,13 +162,40 @@ def test_loss_is_the_probability_of_a_good_action():
 @pytest.mark.parametrize(("drawn", "bolder"), [(10, True), (11, True), (12, False)])
 def test_it_draws_as_boldly_as_it_should(monkeypatch, drawn, bolder):
     """Where drawn episodes are hardly longer than greedy ones, the next ones are drawn bolder."""
-    args = Args(**{**SMALL, "problems": 2, "episodes": 2, "detour": 0.15})
+    args = Args(**{**SMALL, "problems": 2, "episodes": 2, "detour": 0.15, "played_again": 1})
     pupil = SelfImproved(args, SETTING, untrained())
     lengths = np.array([10, drawn, 10, drawn])
     seen, joint = np.zeros((12, 4, 6), np.float32), np.zeros((12, 4), np.int64)
     monkeypatch.setattr(pupil, "episodes", lambda landmarks: (seen, joint, lengths))
     pupil.play()
     assert (pupil.sharpness < 1) == bolder
+
+
+def test_problems_come_again_until_the_greedy_episode_is_shortest(monkeypatch):
+    """Those where it was not wait, the oldest first, and so many of them are played each time."""
+    args = Args(**{**SMALL, "problems": 4, "episodes": 2, "played_again": 2})
+    pupil = SelfImproved(args, SETTING, untrained())
+    seen, joint = np.zeros((9, 8, 6), np.float32), np.zeros((9, 8), np.int64)
+    played = []
+
+    def episodes(landmarks):
+        played.append(landmarks[::2].tolist())
+        return seen, joint, np.array(lengths)
+
+    monkeypatch.setattr(pupil, "episodes", episodes)
+    monkeypatch.setattr(pupil, "as_good", lambda *_: Lessons.of(0, pupil.spec))
+    lengths = [3, 2, 3, 3, 9, 1, 4, 2]
+    pupil.play()
+    first, second, third = (played[0][i] for i in (0, 2, 3))
+    assert pupil.again.tolist() == [first, second, third]
+    lengths = [3, 3, 3, 2, 3, 3, 3, 3]
+    pupil.play()
+    assert played[1][:2] == [first, second]
+    assert pupil.again.tolist() == [third, second]
+    lengths = [3, 3] * 4
+    pupil.play()
+    assert played[2][:2] == [third, second]
+    assert not len(pupil.again)
 
 
 def test_a_full_memory_forgets_the_oldest():
@@ -180,7 +210,7 @@ def test_a_full_memory_forgets_the_oldest():
 
 def test_it_improves(folder, tmp_path):
     """On a small grid, from an untrained policy, nearly all problems are solved optimally."""
-    args = Args(policy=folder, updates=600, out=tmp_path / "run", **SMALL)
+    args = Args(policy=str(folder), updates=600, out=tmp_path / "run", **SMALL)
     problems = unseen_problems(SETTING, 78)
     optima = find_optima(SETTING, problems)
     before = evaluate(load_policy(folder), SETTING, problems, optima).summary()
@@ -193,7 +223,7 @@ def test_it_improves(folder, tmp_path):
 
 def test_stopped_and_resumed_is_the_same(folder, tmp_path, monkeypatch):
     """Stopped by SIGTERM and resumed: the same bytes of metrics and weights."""
-    options = {**SMALL, "updates": 150, "policy": folder, "checkpoint_seconds": 1e9}
+    options = {**SMALL, "updates": 150, "policy": str(folder), "checkpoint_seconds": 1e9}
     assert self_improve.main(Args(out=tmp_path / "whole", **options)) == 0
     update, calls = SelfImproved.update, []
 
