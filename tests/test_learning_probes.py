@@ -212,7 +212,7 @@ def test_end_of_an_episode_leaks_nothing(seed):
         guidance_start=0.0,
         guidance_end=0.0,
         n_problems=1,
-        episodes_per_problem=300,
+        episodes_per_problem=450,
         learning_starts=200,
         update_interval=3,
     )
@@ -336,6 +336,7 @@ def test_imagined_replay_learns_the_values_of_the_rules(seed):
         tried_actions=4,
         imagined_from_depot=0.2,
         imagined_exploration=1.0,
+        imagined_retries=0.0,
         temperature=100.0,
         hidden_units=64,
         code_units=32,
@@ -344,7 +345,7 @@ def test_imagined_replay_learns_the_values_of_the_rules(seed):
     )
     learner = MetaLearner(args, grid, Streams.spawn(seed))
     tell_every_move(learner, grid)
-    updates = 200
+    updates = 300
     for update in range(updates):
         learner.update(update / updates)
     for landmark in grid.reachable.tolist():
