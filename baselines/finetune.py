@@ -49,7 +49,7 @@ from mapp_env import Plan, Problem, mapp_v0, replay, solve
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
 # at sharpnesses from one end to the other, episode by episode.
-SHARPNESS = (0.5, 16.0)
+SHARPNESS = (0.1, 16.0)
 
 
 @dataclass
