@@ -16,11 +16,10 @@ as close to the meta-agent's as an agent by itself can come:
   that points agents to close landmarks while training.
 
 Fairness: the same episodes, and for every network as many updates, of as many states, as the
-meta-agent's one network gets. In the default preset an update costs a bit more than half of the
-meta-agent's, which compares two joint actions in each state, so three learners take somewhat less
-than twice its time, and learners that share their parameters about half of it.
+meta-agent's one network gets. In the default preset three learners take about twice the
+meta-agent's time, and learners that share their parameters about four fifths of it.
 
-Paper: M. Cetinkaya, Multi-Agent Path Planning Using Deep Reinforcement Learning, section 4$
+Paper: M. Cetinkaya, Multi-Agent Path Planning Using Deep Reinforcement Learning, section 5
 (arXiv 2110.01460), which leaves open how independent learners would do.
 
 Command::

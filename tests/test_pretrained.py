@@ -1,0 +1,47 @@
+"""The policies that come with the baselines: what is said of them is so."""
+
+import numpy as np
+import pytest
+
+from baselines import solve
+from baselines.evaluation import evaluate, find_optima
+from baselines.policy import PRETRAINED, load_policy, pretrained_names
+from baselines.settings import Setting
+from mapp_env import make_grid, sample_problems
+
+MIB = 1024 * 1024
+STATED = {"pretrained": (0.40, 98.06), "pretrained-distilled": (0.26, 98.59)}  # gap, optimal
+
+
+def test_these_come_with_the_baselines():
+    """Two, each of less than 4 MiB, with the options that made it."""
+    assert pretrained_names() == sorted(STATED)
+    for name in STATED:
+        assert (PRETRAINED / name / "policy.safetensors").stat().st_size < 4 * MIB
+        assert (PRETRAINED / name / "config.json").is_file()
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_figures_are_those_stated(name):
+    """On 20,000 random problems, within what chance allows; never below the proven optimum."""
+    grid = make_grid()
+    setting = Setting(grid)
+    problems = sample_problems(grid, 20_000, n_landmarks=5, seed=5)
+    optima = find_optima(setting, problems)
+    result = evaluate(load_policy(name), setting, problems, optima)
+    gap, optimal = STATED[name]
+    figures = result.summary()
+    assert figures["solved %"] > 99.9
+    assert figures["gap %"] == pytest.approx(gap, abs=0.15)
+    assert figures["optimal %"] == pytest.approx(optimal, abs=0.5)
+    for cost in ("cover_time", "makespan", "total_distance"):
+        found = getattr(result, cost)[result.success]
+        assert (found >= np.asarray(getattr(optima, cost))[result.success]).all()
+
+
+def test_solve_uses_the_pretrained_policy(capsys):
+    """By default: the routes of the five landmarks, beside the optimum."""
+    assert solve.main(solve.Args((0, 6, 20, 42, 48))) == 0
+    printed = capsys.readouterr().out
+    assert "policy: cover time" in printed
+    assert "optimum: cover time 12" in printed
