@@ -64,8 +64,10 @@ class Args(ImitationOptions):
     """rectifier units in the hidden layer"""
     code_units: int = 64
     """numbers that describe an agent"""
-    landmark_units: int = 64
+    landmark_units: int = 48
     """numbers that describe a landmark"""
+    route_units: int = 16
+    """numbers that describe an agent among pairs of landmarks"""
 
     batch_size: int = 512
     """states in an update"""
@@ -112,6 +114,7 @@ class Distilled(Pupil):
             outputs="joint",
             code_units=args.code_units,
             landmark_units=args.landmark_units,
+            route_units=args.route_units,
         )
         network = build_network(spec, torch_generator(seeds))
         super().__init__(args, network, np.random.default_rng(states))

@@ -19,7 +19,7 @@ from torch import Tensor
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.checkpoints import Checkpoints, part
-from baselines.checks import check_count, check_number
+from baselines.checks import check_count, check_flag, check_number
 from baselines.evaluation import (
     count_unseen,
     evaluate,
@@ -30,7 +30,7 @@ from baselines.evaluation import (
 )
 from baselines.networks import Network
 from baselines.optimiser import optimiser_arrays, restore_optimiser
-from baselines.policy import NetworkPolicy, save_policy
+from baselines.policy import load_policy, save_policy
 from baselines.runs import (
     TIMING_FILE,
     WEIGHTS_FILE,
@@ -60,6 +60,10 @@ class ImitationOptions:
     """steps of Adam"""
     learning_rate: float = 0.003
     """step size of Adam; it falls in a straight line to 0"""
+    weight_decay: float = 0.1
+    """share of every weight, times the step size, that each update takes off it"""
+    half_precision: bool = True
+    """keep the policy's weights in 16 bits"""
     evaluation_problems: int = 1000
     """problems for the table at the end, 0 for none"""
     checkpoint_seconds: float = 30.0
@@ -71,6 +75,8 @@ class ImitationOptions:
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_count("updates", self.updates, 1, 1_000_000_000)
         check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
+        check_number("weight_decay", self.weight_decay, 0.0, 1.0)
+        check_flag("half_precision", self.half_precision)
         check_count("evaluation_problems", self.evaluation_problems, 0, 1_000_000)
         check_number("checkpoint_seconds", self.checkpoint_seconds, 0.0, 1e9)
         check_count("threads", self.threads, 1, 1024)
@@ -92,7 +98,10 @@ class Pupil(ABC):
     def __init__(self, args: ImitationOptions, network: Network, rng: np.random.Generator) -> None:
         self.args, self.network, self.rng = args, network, rng
         self.spec = network.spec
-        self.optimiser = torch.optim.Adam(self.network.parameters(), fused=True)
+        # Without decay the weights grow as the gradients vanish, and steps of Adam become noise.
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), weight_decay=args.weight_decay, fused=True
+        )
         self.updates = 0
         self.losses: list[float] = []  # since the last row of metrics.csv
         self.seconds = 0.0
@@ -226,7 +235,7 @@ def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopS
             saved = time.monotonic()
     bar.close()
     save()
-    save_policy(run.path(WEIGHTS_FILE), pupil.network)
+    save_policy(run.path(WEIGHTS_FILE), pupil.network, args.half_precision)
     run.write_json(
         TIMING_FILE, {"updates": pupil.updates, "seconds_total": round(pupil.seconds, 3)}
     )
@@ -271,7 +280,8 @@ def run_imitation(
     try:
         checkpoints = Checkpoints(folder, identity)
         if args.resume is None:
-            save_policy(run.path(WEIGHTS_FILE), pupil.network)  # what it starts from
+            # What it starts from.
+            save_policy(run.path(WEIGHTS_FILE), pupil.network, args.half_precision)
             run.write_config(identity)
         else:
             go_on(pupil, run, checkpoints)
@@ -282,7 +292,7 @@ def run_imitation(
             return 128 + signals.received
         if n_evaluated:
             problems = unseen_problems(setting, n_evaluated, seen)
-            policy = NetworkPolicy(pupil.network)
+            policy = load_policy(folder)  # as it was kept, so perhaps rounded
             optima = find_optima(setting, problems)
             table = {"network alone": evaluate(policy, setting, problems, optima)}
             save_table(folder, table)

@@ -112,6 +112,7 @@ def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Team:
         dueling=args.dueling,
         code_units=args.code_units,
         landmark_units=args.landmark_units,
+        route_units=args.route_units,
         team="shared" if args.share_parameters else "independent",
     )
     team = build_network(spec, generator)

@@ -75,6 +75,7 @@ def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Network:
         dueling=args.dueling,
         code_units=args.code_units,
         landmark_units=args.landmark_units,
+        route_units=args.route_units,
     )
     return build_network(spec, generator)
 

@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-from numba import njit  # type: ignore[import-untyped]
 from torch import Tensor, nn
 
 from baselines.bags import Bag
 from baselines.checks import check_choice, check_count, check_flag
+from baselines.lookups import arrange, between_landmarks, routes
 
 MAX_WEIGHTS = 20_000_000  # numbers in a network: 76 MiB
 MAX_JOINT_ACTIONS = 1024
@@ -38,6 +38,7 @@ class NetworkSpec:
     dueling: bool = False  # a value and advantages (Wang et al. 2016) in place of values
     code_units: int = 64  # of "pairs": numbers that describe an agent among the landmarks
     landmark_units: int = 0  # of "pairs": numbers that describe a landmark among the agents
+    route_units: int = 0  # of "pairs": numbers that describe an agent among pairs of landmarks
     team: str = "one"  # one network for all agents, one for each, or one that each uses by itself
 
     def __post_init__(self) -> None:
@@ -51,6 +52,7 @@ class NetworkSpec:
         check_flag("dueling", self.dueling)
         check_count("code_units", self.code_units, 1, 4096)
         check_count("landmark_units", self.landmark_units, 0, 4096)
+        check_count("route_units", self.route_units, 0, 4096)
         check_choice("team", self.team, TEAMS)
         if self.team != "one":
             check_choice("outputs", self.outputs, ("agents",))
@@ -109,6 +111,10 @@ class NetworkSpec:
             first += (self.n_cells + 1 + self.n_agents * self.code_units + 1) * hidden
             first += (self.n_inputs - self.observation_size) * hidden
             first += self.landmark_units * (self.n_agents * n_pairs + hidden)
+            if self.route_units:
+                n_routes = self.n_cells * math.comb(self.n_cells, 2) + 1
+                first += self.route_units * (n_pairs + n_routes + self.n_agents * hidden)
+                first += self.landmark_units * (self.n_cells + 1) ** 2
         return (self.n_agents if self.team == "independent" else 1) * (first + last)
 
     def as_dict(self) -> dict[str, int | str | bool]:
@@ -176,8 +182,10 @@ class PairsNetwork(nn.Module):
     An agent is described by the sum, over the unvisited landmarks, of a learned vector for the pair
     (its cell, the landmark's cell), and by one for its cell. The agents' descriptions, in the order
     of their cells, and the set of unvisited landmarks go through a layer of rectifier units. With
-    ``landmark_units`` the landmarks are described among the agents as well, and summed. Values
-    are given back in the agents' own order, so that, exactly:
+    ``landmark_units`` the landmarks are described among the agents as well, and summed. With
+    ``route_units`` agents are described among pairs of landmarks too, as a route through several
+    is not the sum of the ways to each; and landmarks among one another. Values are given back in
+    the agents' own order, so that, exactly:
 
     - to rename landmarks changes nothing, and where the visited ones stand does not matter;
     - to rename agents renames their actions.
@@ -194,10 +202,10 @@ class PairsNetwork(nn.Module):
         self.spec = spec
         n, units = spec.n_agents, spec.code_units
         n_pairs = spec.n_cells * (spec.n_cells + 2)  # arrange says why 2
-        self.pairs = Bag(n_pairs, units, 0.3, generator)
+        self.pairs = Bag(n_pairs, units + spec.route_units, 0.3, generator)
         self.unvisited = Bag(spec.n_cells + 1, spec.hidden_units, 0.1, generator)
         self.crossed = None
-        n_codes = n * units
+        n_codes = n * (units + spec.route_units)
         if spec.landmark_units:
             self.crossed = Bag(n * n_pairs, spec.landmark_units, 0.3, generator)
             self.register_buffer("slots", torch.arange(n) * n_pairs, persistent=False)
@@ -205,21 +213,24 @@ class PairsNetwork(nn.Module):
         self.hidden = linear(n_codes, spec.hidden_units, generator)
         self.head = Head(spec, generator)
         self.whose = Bag(n, spec.hidden_units, 0.1, generator) if spec.team == "shared" else None
+        self.routes = self.between = None
+        if spec.route_units:
+            n_routes = spec.n_cells * math.comb(spec.n_cells, 2) + 1
+            self.routes = Bag(n_routes, spec.route_units, 0.1, generator)
+            if spec.landmark_units:
+                n_between = (spec.n_cells + 1) ** 2
+                self.between = Bag(n_between, spec.landmark_units, 0.1, generator)
         self.register_buffer("orders", _joint_actions_by_order(spec), persistent=False)
 
     def forward(self, observations: Tensor) -> Tensor:
         """Return action values, (B, N, A) or (B, A ** N), of global observations (B, N + 2K)."""
         spec = self.spec
         n, k = spec.n_agents, spec.n_landmarks
-        pairs, landmarks, order = map(
-            torch.from_numpy,
-            arrange(observations.numpy(), n, k, spec.n_cells, spec.team == "one"),
+        pairs, landmarks, order = arrange(
+            observations.numpy(), n, k, spec.n_cells, spec.team == "one"
         )
-        codes = torch.relu_(self.pairs(pairs.view(-1, k + 1))).view(-1, n * spec.code_units)
-        if self.crossed is not None:
-            seen = (pairs[:, :, :k] + self.slots[:, None]).transpose(1, 2).reshape(-1, n)
-            crossed = torch.relu_(self.crossed(seen)).view(-1, k, spec.landmark_units).sum(1)
-            codes = torch.cat((codes, crossed), 1)
+        codes = self.codes(pairs, landmarks)
+        landmarks, order = torch.from_numpy(landmarks), torch.from_numpy(order)
         hidden = self.hidden(codes) + self.unvisited(landmarks)
         if self.whose is not None:
             whose = observations[:, n + 2 * k :].argmax(dim=1, keepdim=True)
@@ -233,46 +244,27 @@ class PairsNetwork(nn.Module):
         rank = order.argsort(dim=1)
         return values.gather(1, rank[:, :, None].expand(-1, -1, spec.n_actions))
 
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def arrange(observations, n, k, n_cells, sort):  # type: ignore[no-untyped-def]
-    """Return what is to be looked up for global observations (B, N + 2K).
-
-    Two places are added to the grid's cells: where all visited landmarks are put, and one that
-    every agent pairs with besides, for what its cell says by itself.
-
-    Returns
-    -------
-    pairs
-        (B, N, K + 1) of each agent, its cell with each landmark's and with the second added place.
-    landmarks
-        (B, K) the landmarks' cells, or the first added place.
-    order
-        (B, N) the agents in the order of `pairs`: with `sort` that of their cells, of equal
-        ones the first.
-    """
-    n_rows, n_places = len(observations), n_cells + 2
-    pairs = np.empty((n_rows, n, k + 1), np.int64)
-    landmarks = np.empty((n_rows, k), np.int64)
-    order = np.empty((n_rows, n), np.int64)
-    for row in range(n_rows):
-        for index in range(k):
-            visited = observations[row, n + k + index] > 0
-            landmarks[row, index] = n_cells if visited else observations[row, n + index]
-        for agent in range(n):
-            place = agent
-            while sort and place > 0:
-                if observations[row, order[row, place - 1]] <= observations[row, agent]:
-                    break
-                order[row, place] = order[row, place - 1]
-                place -= 1
-            order[row, place] = agent
-        for agent in range(n):
-            cell = np.int64(observations[row, order[row, agent]])
-            for index in range(k):
-                pairs[row, agent, index] = cell * n_places + landmarks[row, index]
-            pairs[row, agent, k] = cell * n_places + n_cells + 1
-    return pairs, landmarks, order
+    def codes(self, pairs: np.ndarray, landmarks: np.ndarray) -> Tensor:
+        """Return what describes agents and landmarks: (B, units), of what `arrange` returned."""
+        spec = self.spec
+        n, k = spec.n_agents, spec.n_landmarks
+        looked_up = torch.from_numpy(pairs)
+        agents = self.pairs(looked_up.view(-1, k + 1))
+        if self.routes is not None:
+            through = torch.from_numpy(routes(pairs, landmarks, spec.n_cells))
+            ways = agents[:, spec.code_units :] + self.routes(through)
+            agents = torch.cat((agents[:, : spec.code_units], ways), 1)
+        codes = torch.relu_(agents).view(-1, n * (spec.code_units + spec.route_units))
+        if self.crossed is None:
+            return codes
+        seen = (looked_up[:, :, :k] + self.slots[:, None]).transpose(1, 2).reshape(-1, n)
+        crossed = self.crossed(seen)
+        if self.between is not None:
+            crossed = crossed + self.between(
+                torch.from_numpy(between_landmarks(landmarks, spec.n_cells))
+            )
+        crossed = torch.relu_(crossed).view(-1, k, spec.landmark_units).sum(1)
+        return torch.cat((codes, crossed), 1)
 
 
 def _joint_actions_by_order(spec: NetworkSpec) -> Tensor:

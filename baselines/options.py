@@ -61,6 +61,8 @@ class Options:
     """numbers that describe an agent in the network "pairs\""""
     landmark_units: int = 0
     """numbers that describe a landmark in the network "pairs\""""
+    route_units: int = 0
+    """numbers that describe an agent among pairs of landmarks in the network "pairs\""""
 
     learning_rate: float = 0.006
     """step size of Adam"""
@@ -178,6 +180,7 @@ COUNTS = (
     ("hidden_units", 1, 4096),
     ("code_units", 1, 4096),
     ("landmark_units", 0, 4096),
+    ("route_units", 0, 4096),
     ("learning_rate_warmup", 0, 1_000_000_000),
     ("batch_size", 1, 65_536),
     ("learning_starts", 1, 1_000_000_000),
