@@ -60,7 +60,7 @@ class Args(ImitationOptions):
     max_cycles: int = 50
     """step limit of an episode"""
 
-    hidden_units: int = 384
+    hidden_units: int = 512
     """rectifier units in the hidden layer"""
     code_units: int = 64
     """numbers that describe an agent"""

@@ -60,7 +60,7 @@ class ImitationOptions:
     """steps of Adam"""
     learning_rate: float = 0.003
     """step size of Adam; it falls in a straight line to 0"""
-    weight_decay: float = 0.1
+    weight_decay: float = 0.05
     """share of every weight, times the step size, that each update takes off it"""
     half_precision: bool = True
     """keep the policy's weights in 16 bits"""

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from baselines.bags import Bag
+from baselines.lookups import arrange, between_landmarks, routes
 from baselines.networks import (
     Head,
     NetworkSpec,
-    arrange,
     build_network,
     greedy_actions,
     split_joint,
@@ -21,6 +21,7 @@ from mapp_env import make_grid
 
 GRID = make_grid("paper-7x7")
 KINDS = ("paper", "pairs")
+ROUTES = {"landmark_units": 6, "route_units": 5}
 
 
 def network_of(kind: str, n_agents: int, n_landmarks: int, outputs: str, **changes: object):
@@ -48,11 +49,11 @@ def values_of(network, seen: np.ndarray) -> np.ndarray:
 # -- symmetries --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dueling", [False, True])
+@pytest.mark.parametrize("changes", [{}, {"dueling": True}, ROUTES])
 @pytest.mark.parametrize("n_agents", [1, 2, 3, 4])
-def test_renaming_agents_renames_joint_values(n_agents, dueling):
+def test_renaming_agents_renames_joint_values(n_agents, changes):
     """Agents on distinct cells in another order: the same numbers, at the renamed joint actions."""
-    network = network_of("pairs", n_agents, 3, "joint", dueling=dueling)
+    network = network_of("pairs", n_agents, 3, "joint", **changes)
     seen = observations(30, n_agents, 3)
     own = values_of(network, seen).reshape(30, *[4] * n_agents)
     for order in permutations(range(n_agents)):
@@ -78,10 +79,11 @@ def test_renaming_agents_renames_their_own_values(n_agents):
     assert not np.array_equal(own[:, 0], own[:, 1])
 
 
+@pytest.mark.parametrize("changes", [{}, ROUTES, {"route_units": 5}])
 @pytest.mark.parametrize("outputs", ["joint", "agents"])
-def test_renaming_landmarks_changes_nothing(outputs):
+def test_renaming_landmarks_changes_nothing(outputs, changes):
     """Landmarks in any order, each with its flag, give the same values but for rounding."""
-    network = network_of("pairs", 3, 4, outputs)
+    network = network_of("pairs", 3, 4, outputs, **changes)
     seen = observations(30, 3, 4)
     own = values_of(network, seen)
     for order in permutations(range(4)):
@@ -90,10 +92,11 @@ def test_renaming_landmarks_changes_nothing(outputs):
         np.testing.assert_allclose(values_of(network, renamed), own, atol=1e-6)
 
 
+@pytest.mark.parametrize("changes", [{}, ROUTES, {"route_units": 5}])
 @pytest.mark.parametrize("outputs", ["joint", "agents"])
-def test_where_visited_landmarks_stand_does_not_matter(outputs):
+def test_where_visited_landmarks_stand_does_not_matter(outputs, changes):
     """Visited ones may be moved anywhere without a bit of difference; unvisited ones may not."""
-    network = network_of("pairs", 3, 4, outputs)
+    network = network_of("pairs", 3, 4, outputs, **changes)
     seen = observations(60, 3, 4)
     own = values_of(network, seen)
     flags = seen[:, 7:] == 1
@@ -230,6 +233,11 @@ SMALL = {
         ({"hidden_units": 4097}, r"^hidden_units must be .* got 4097"),
         ({"code_units": 0}, r"^code_units must be .* got 0"),
         ({"code_units": 2.0}, r"^code_units must be .* got 2\.0"),
+        ({"route_units": -1}, r"^route_units must be .* got -1"),
+        (
+            {"kind": "pairs", "n_cells": 400, "route_units": 1},
+            r"^kind 'pairs' would have 42,\d{3},\d{3} weights on 400",
+        ),
         ({"outputs": "both"}, r"^outputs must be one of agents, joint, got 'both'"),
         ({"dueling": 1}, r"^dueling must be True or False, got 1"),
         ({"outputs": "joint", "n_agents": 6}, r"^outputs must be 'agents' for 6 .* 4,096 .* 1,024"),
@@ -267,6 +275,9 @@ def test_networks_at_the_limit_can_be_built(changes):
     "changes",
     [
         {"kind": "pairs", "outputs": "joint", "landmark_units": 7, "code_units": 5},
+        {"kind": "pairs", "outputs": "joint", "route_units": 3, "landmark_units": 7},
+        {"kind": "pairs", "n_landmarks": 1, "route_units": 3},
+        {"kind": "pairs", "team": "independent", "landmark_units": 3, "route_units": 2},
         {"kind": "pairs", "dueling": True},
         {"kind": "paper", "outputs": "joint", "dueling": True},
         {"kind": "pairs", "team": "shared"},
@@ -309,3 +320,36 @@ def test_what_is_looked_up(sort):
     assert order.tolist() == ([[1, 0, 2]] if sort else [[0, 1, 2]])
     five, two = [5 * 11 + 3, 5 * 11 + 9, 5 * 11 + 10], [2 * 11 + 3, 2 * 11 + 9, 2 * 11 + 10]
     assert pairs.tolist() == [[two, five, five] if sort else [five, two, five]]
+
+
+def test_routes_are_numbered_by_cell_and_pair_of_landmarks():
+    """One row for each cell and two landmarks in either order; the last where one is visited."""
+    numbers = {}
+    for cell, one, other in product(range(4), repeat=3):
+        if one == other:
+            continue
+        seen = np.array([[cell, 3, one, other, 2, 0, 0, 1]], np.float32)
+        pairs, landmarks, order = arrange(seen, 2, 3, 4, True)
+        rows = routes(pairs, landmarks, 4)  # of the two, of the first and third, of the others
+        own = rows[order[0].tolist().index(0)]
+        assert own.tolist() == [own[0], 4 * 6, 4 * 6]
+        numbers.setdefault((cell, min(one, other), max(one, other)), set()).add(own[0])
+    assert all(len(rows) == 1 for rows in numbers.values())
+    assert sorted(*zip(*numbers.values(), strict=True)) == list(range(4 * 6))
+
+
+def test_a_single_landmark_makes_no_pair():
+    """It has the row of pairs with a visited landmark, and a network can be built."""
+    seen = np.array([[1, 3, 2, 0]], np.float32)
+    pairs, landmarks, _ = arrange(seen, 2, 1, 4, True)
+    assert routes(pairs, landmarks, 4).tolist() == [[24], [24]]
+    network = network_of("pairs", 2, 1, "joint", **ROUTES)
+    assert np.isfinite(values_of(network, seen)).all()
+
+
+def test_landmarks_among_one_another():
+    """Row j of each landmark: itself and each landmark, visited ones in the place behind."""
+    assert between_landmarks(np.array([[2, 4]]), 4).tolist() == [
+        [2 * 5 + 2, 2 * 5 + 4],
+        [4 * 5 + 2, 4 * 5 + 4],
+    ]
