@@ -63,7 +63,7 @@ class ImitationOptions:
     weight_decay: float = 0.05
     """share of every weight, times the step size, that each update takes off it"""
     half_precision: bool = True
-    """keep the policy's weights in 16 bits"""
+    """keep the finished policy's weights in 16 bits"""
     evaluation_problems: int = 1000
     """problems for the table at the end, 0 for none"""
     checkpoint_seconds: float = 30.0
@@ -280,8 +280,8 @@ def run_imitation(
     try:
         checkpoints = Checkpoints(folder, identity)
         if args.resume is None:
-            # What it starts from.
-            save_policy(run.path(WEIGHTS_FILE), pupil.network, args.half_precision)
+            # What it starts from, to the bit: it may have to start again.
+            save_policy(run.path(WEIGHTS_FILE), pupil.network)
             run.write_config(identity)
         else:
             go_on(pupil, run, checkpoints)

@@ -109,12 +109,14 @@ def save_policy(path: Path, network: Network, half_precision: bool = False) -> N
     """Write a network's weights and its spec to a safetensors file, in one piece.
 
     With `half_precision` in 16 bits each, rounded: half the size, and nearly the same values.
+    Tensors with values that 16 bits have no room for keep theirs.
     """
     # One metadata entry only: safetensors writes several in no fixed order.
     about = json.dumps({"version": WEIGHTS_VERSION, **network.spec.as_dict()}, sort_keys=True)
     tensors = {name: t.detach().contiguous() for name, t in network.state_dict().items()}
     if half_precision:
-        tensors = {name: t.half() for name, t in tensors.items()}
+        most = torch.finfo(torch.float16).max
+        tensors = {k: t.half() if t.abs().max() <= most else t for k, t in tensors.items()}
     write_atomically(path, safetensors.torch.save(tensors, {WEIGHTS_KEY: about}))
 
 

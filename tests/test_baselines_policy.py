@@ -66,6 +66,22 @@ def test_saving_twice_writes_the_same_bytes(tmp_path, network):
     assert sorted(os.listdir(tmp_path)) == ["one", "two"]
 
 
+def test_half_precision_rounds_each_weight_and_halves_the_file(tmp_path, network):
+    """What is loaded are the weights rounded to 16 bits, but for tensors that do not fit there."""
+    with torch.no_grad():
+        network.layers[2].bias[3] = 1e6
+    save_policy(tmp_path / "whole", network)
+    save_policy(tmp_path / "half", network, half_precision=True)
+    sizes = [(tmp_path / name).stat().st_size for name in ("whole", "half")]
+    assert sizes[1] < 0.8 * sizes[0]
+    whole, half = (load_policy(tmp_path / name).network.state_dict() for name in ("whole", "half"))
+    for name, tensor in whole.items():
+        rounded = tensor if name == "layers.2.bias" else tensor.half().float()
+        assert half[name].dtype == torch.float32
+        assert torch.equal(half[name], rounded)
+        assert name == "layers.2.bias" or not torch.equal(tensor, rounded)
+
+
 def test_start_weights_follow_the_seed():
     """One seed gives one network, another seed another one."""
     one, same, other = (

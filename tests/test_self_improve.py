@@ -210,7 +210,7 @@ def test_a_full_memory_forgets_the_oldest():
 
 def test_it_improves(folder, tmp_path):
     """On a small grid, from an untrained policy, nearly all problems are solved optimally."""
-    args = Args(policy=str(folder), updates=600, out=tmp_path / "run", **SMALL)
+    args = Args(policy=str(folder), updates=1000, out=tmp_path / "run", **SMALL)
     problems = unseen_problems(SETTING, 78)
     optima = find_optima(SETTING, problems)
     before = evaluate(load_policy(folder), SETTING, problems, optima).summary()
