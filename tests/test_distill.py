@@ -20,6 +20,7 @@ SMALL = {
     "hidden_units": 32,
     "code_units": 16,
     "landmark_units": 8,
+    "route_units": 4,
     "batch_size": 64,
     "evaluation_problems": 0,
 }
@@ -91,6 +92,23 @@ def test_wrong_answers_are_asked_again_until_they_are_right():
     assert len(pupil.mistakes) > 50
     for array in pupil.own_arrays()["mistakes"].values():
         assert len(array) == len(pupil.mistakes)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.3])
+def test_weights_decay_with_the_step_size(decay):
+    """Vectors that are never looked up shrink by the step size times the decay, and only so."""
+    args = distill.Args(**SMALL, weight_decay=decay, updates=4, learning_rate=0.5)
+    pupil = distill.Distilled(args, make_grid())
+    wall = next(cell for cell in range(49) if make_grid().walls.flat[cell])
+    row = wall * 51 + wall  # an agent in a wall, and a landmark there
+    start = pupil.network.pairs.weight[row].detach().clone()
+    expected = start.clone()
+    for update in range(4):
+        rate = 0.5 * (1 - update / 4) * (update + 1) / 200  # it rises for 200 updates
+        expected *= 1 - rate * decay
+        pupil.update()
+    torch.testing.assert_close(pupil.network.pairs.weight[row], expected, rtol=1e-6, atol=0.0)
+    assert torch.equal(expected, start) == (decay == 0.0)
 
 
 @pytest.mark.parametrize("changes", [{"n_landmarks": 3}, {"n_landmarks": 2, "n_agents": 6}])
