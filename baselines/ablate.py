@@ -39,7 +39,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "no retries": ("--imagined-retries", "0"),
     "double DQN": ("--double",),
     "no dueling": ("--no-dueling",),
-    "no retries": ("--imagined-retries", "0"),
     "constant step size": ("--no-learning-rate-falls",),
     "guidance": ("--guidance-start", "1", "--guidance-end", "0.1"),
 }
