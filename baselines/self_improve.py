@@ -5,7 +5,8 @@ problems in the batched environment, greedily but for a few random steps. In eac
 comes to, its likeliest joint actions are tried, side by side: the episode is played again up to
 there, then the action, then on greedily until all is visited. The network is taught to prefer those
 after which that was soonest, all alike, to the others that were tried. States in which the greedy
-action was none of the best are taught more often, and their problems come again.
+action was none of the best are taught more often, and their problems come again. It is the slowly
+moving average of the network that plays, since what it finds must not be worse than what is there.
 
 This is reinforcement learning by trial alone: all that is known of a problem is how long one's own
 episodes on it took, never the optimum, and walls are met by bumping into them. As many problems are
@@ -21,6 +22,7 @@ Command::
 Output: a run folder as of meta_dqn.py (no figures), with a row of metrics.csv per 100 updates.
 """
 
+import copy
 import sys
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -58,7 +60,7 @@ class Args(ImitationOptions):
 
     policy: str | None = None
     """a meta-agent with joint values to start from: a run folder, or a pretrained policy's name"""
-    learning_rate: float = 0.0015
+    learning_rate: float = 0.001
     """step size of Adam; it falls in a straight line to 0"""
     weight_decay: float = 0.1
     """share of every weight, times the step size, that each update takes off it"""
@@ -82,6 +84,8 @@ class Args(ImitationOptions):
     """states that are kept to be taught, the newest"""
     kept_mistakes: int = 2_000
     """mistakes that are kept, the newest"""
+    averaging: float = 0.001
+    """how far the average of the network goes towards the network with each update"""
     sharpness: float = 8.0
     """what the values of the policy are multiplied by to be read as logits at the start"""
 
@@ -97,6 +101,7 @@ class Args(ImitationOptions):
         check_count("mistakes_batch", self.mistakes_batch, 0, 65_536)
         check_count("kept_states", self.kept_states, 1, 10_000_000)
         check_count("kept_mistakes", self.kept_mistakes, 1, 10_000_000)
+        check_number("averaging", self.averaging, 1e-9, 1.0)
         check_number("sharpness", self.sharpness, 1e-6, 1e6)
 
 
@@ -168,6 +173,7 @@ class SelfImproved(Pupil):
         if network.spec.outputs != "joint":
             raise ValueError("policy must be a meta-agent's with joint values (--outputs joint)")
         super().__init__(args, network, np.random.default_rng(args.seed))
+        self.player = copy.deepcopy(network).requires_grad_(False)  # the average
         self.n_tried = min(args.alternatives, self.spec.n_joint_actions)
         self.cells = setting.grid.reachable
         self.envs = make_vec(
@@ -197,6 +203,12 @@ class SelfImproved(Pupil):
         seen, tried, good = map(torch.from_numpy, both)
         scores = self.network(seen).masked_fill(~tried, -torch.inf)
         return good_actions_loss(scores, good)
+
+    def update(self) -> None:
+        """Learn from one batch, and move the average."""
+        super().update()
+        for mean, weights in zip(self.player.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(weights.detach(), self.args.averaging)
 
     def play(self) -> None:
         """Play new problems, and keep what is best in each state on the way."""
@@ -325,9 +337,9 @@ class SelfImproved(Pupil):
         return self.envs.reset(options={"landmarks": problems})[0]
 
     def scores(self, seen: np.ndarray) -> np.ndarray:
-        """Return the network's scores (B, A ** N) of observations."""
+        """Return the average network's scores (B, A ** N) of observations."""
         with torch.inference_mode():
-            scores: np.ndarray = self.network(torch.from_numpy(seen)).numpy()
+            scores: np.ndarray = self.player(torch.from_numpy(seen)).numpy()
         return scores
 
     def split(self, joint: np.ndarray) -> np.ndarray:
@@ -335,8 +347,9 @@ class SelfImproved(Pupil):
         return split_joint(joint, self.spec.n_agents, self.spec.n_actions)
 
     def own_arrays(self) -> dict[str, dict[str, np.ndarray]]:
-        """Return the lessons, and what is played again."""
+        """Return the average, the lessons, and what is played again."""
         return {
+            "player": {name: t.numpy() for name, t in self.player.state_dict().items()},
             "kept": self.kept.arrays(),
             "mistakes": self.mistakes.arrays(),
             "round": {"again": self.again, "left": np.array(self.left)},
@@ -344,6 +357,8 @@ class SelfImproved(Pupil):
 
     def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`own_arrays` returned."""
+        average = part(arrays, "player")
+        self.player.load_state_dict({k: torch.from_numpy(v) for k, v in average.items()})
         self.kept.restore(part(arrays, "kept"))
         self.mistakes.restore(part(arrays, "mistakes"))
         self.again, self.left = arrays["round.again"].copy(), int(arrays["round.left"])

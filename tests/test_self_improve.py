@@ -1,5 +1,6 @@
 """Self-improvement: what is taught is what turned out best among what was tried, and it helps."""
 
+import copy
 import json
 import os
 import signal
@@ -31,6 +32,7 @@ SMALL = {
     "evaluation_problems": 0,
     "sharpness": 1.0,
     "alternatives": 6,
+    "averaging": 0.02,
 }
 
 
@@ -221,6 +223,22 @@ def test_loss_is_the_probability_of_a_good_action():
     scores = torch.log(torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
     good = torch.tensor([[False, True, False, True]])
     assert float(imitation.good_actions_loss(scores, good)) == pytest.approx(-np.log(0.6))
+
+
+def test_the_average_plays(half_trained):
+    """It starts as the network, goes a share of the way to it with each update, and scores."""
+    pupil = SelfImproved(Args(**{**SMALL, "averaging": 0.25}), SETTING, copy.deepcopy(half_trained))
+    seen = np.zeros((1, 6), np.float32)
+    mean = pupil.network.hidden.weight.detach().clone()
+    assert torch.equal(pupil.player.hidden.weight, mean)
+    for _ in range(3):
+        pupil.update()
+        mean += 0.25 * (pupil.network.hidden.weight.detach() - mean)
+        torch.testing.assert_close(pupil.player.hidden.weight, mean)
+    assert not torch.equal(pupil.network.hidden.weight, mean)
+    with torch.inference_mode():
+        scores = pupil.player(torch.from_numpy(seen)).numpy()
+    np.testing.assert_array_equal(pupil.scores(seen), scores)
 
 
 @pytest.mark.parametrize("at_a_time", [3, 7])
