@@ -80,9 +80,11 @@ class Args(ImitationOptions):
     """states in an update"""
     mistakes_batch: int = 128
     """states in an update besides, of those in which the greedy action was a mistake"""
-    kept_states: int = 20_000
+    learning_starts: int = 30_000
+    """states that are tried before the first update"""
+    kept_states: int = 300_000
     """states that are kept to be taught, the newest"""
-    kept_mistakes: int = 2_000
+    kept_mistakes: int = 20_000
     """mistakes that are kept, the newest"""
     averaging: float = 0.001
     """how far the average of the network goes towards the network with each update"""
@@ -99,6 +101,7 @@ class Args(ImitationOptions):
         check_count("updates_per_round", self.updates_per_round, 1, 65_536)
         check_count("batch_size", self.batch_size, 1, 65_536)
         check_count("mistakes_batch", self.mistakes_batch, 0, 65_536)
+        check_count("learning_starts", self.learning_starts, 0, 10_000_000)
         check_count("kept_states", self.kept_states, 1, 10_000_000)
         check_count("kept_mistakes", self.kept_mistakes, 1, 10_000_000)
         check_number("averaging", self.averaging, 1e-9, 1.0)
@@ -129,7 +132,7 @@ class NewestLessons:
             np.zeros((size, spec.n_joint_actions), np.bool_),
             np.zeros((size, spec.n_joint_actions), np.bool_),
         )
-        self.n = 0  # ever; the next goes to row n % size
+        self.n = 0  # so many ever; the next goes to row n % size
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -195,6 +198,8 @@ class SelfImproved(Pupil):
         args = self.args
         if self.left == 0:
             self.play()
+            while self.kept.n < args.learning_starts:
+                self.play()
             self.left = args.updates_per_round
         self.left -= 1
         usual = self.kept.draw(args.batch_size, self.rng)

@@ -26,6 +26,7 @@ SMALL = {
     "updates_per_round": 8,
     "batch_size": 32,
     "mistakes_batch": 32,
+    "learning_starts": 50,
     "kept_states": 500,
     "kept_mistakes": 100,
     "learning_rate": 0.005,
