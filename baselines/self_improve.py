@@ -3,10 +3,10 @@
 Method: policy iteration by classification (Lagoudakis and Parr 2003). The policy plays random
 problems in the batched environment, greedily but for a few random steps. In each state that it
 comes to, its likeliest joint actions are tried, side by side: the episode is played again up to
-there, then the action, then on greedily until all is visited. The network is taught to prefer those
-after which that was soonest, all alike, to the others that were tried. States in which the greedy
-action was none of the best are taught more often, and their problems come again. It is the slowly
-moving average of the network that plays, since what it finds must not be worse than what is there.
+there, then the action, then on greedily until all is visited. Those after which that was soonest
+are what the network is taught in this state, all alike. States in which the greedy action was none
+of them are taught more often, and their problems come again. It is the slowly moving average of the
+network that plays, since what it finds must not be worse than what is there.
 
 This is reinforcement learning by trial alone: all that is known of a problem is how long one's own
 episodes on it took, never the optimum, and walls are met by bumping into them. As many problems are
@@ -112,11 +112,10 @@ class Args(ImitationOptions):
 
 
 class Lessons(NamedTuple):
-    """States, and what was tried in them."""
+    """States, and what is good in them."""
 
     seen: np.ndarray  # (B, N + 2K) float32
-    tried: np.ndarray  # (B, A ** N) bool, joint actions
-    good: np.ndarray  # (B, A ** N) bool, the best of those
+    good: np.ndarray  # (B, A ** N) bool, joint actions
 
     def where(self, chosen: np.ndarray | slice) -> "Lessons":
         """Return some of them."""
@@ -129,7 +128,6 @@ class NewestLessons:
     def __init__(self, size: int, spec: NetworkSpec) -> None:
         self.rows = Lessons(
             np.zeros((size, spec.observation_size), np.float32),
-            np.zeros((size, spec.n_joint_actions), np.bool_),
             np.zeros((size, spec.n_joint_actions), np.bool_),
         )
         self.n = 0  # so many ever; the next goes to row n % size
@@ -205,9 +203,8 @@ class SelfImproved(Pupil):
         usual = self.kept.draw(args.batch_size, self.rng)
         mistakes = self.mistakes.draw(args.mistakes_batch, self.rng)
         both = (np.concatenate(arrays) for arrays in zip(usual, mistakes, strict=True))
-        seen, tried, good = map(torch.from_numpy, both)
-        scores = self.network(seen).masked_fill(~tried, -torch.inf)
-        return good_actions_loss(scores, good)
+        seen, good = map(torch.from_numpy, both)
+        return good_actions_loss(self.network(seen), good)
 
     def update(self) -> None:
         """Learn from one batch, and move the average."""
@@ -295,14 +292,13 @@ class SelfImproved(Pupil):
         """
         scores = self.scores(seen)
         likeliest = np.argpartition(scores, -self.n_tried, axis=1)[:, -self.n_tried :]
-        tried, good = np.zeros((2, *scores.shape), np.bool_)
-        np.put_along_axis(tried, likeliest, True, axis=1)
+        good = np.zeros(scores.shape, np.bool_)
         for first in range(0, len(times), self.args.problems):
             some = slice(first, first + self.args.problems)
             self.try_actions(
                 landmarks, joint, times[some], problems[some], likeliest[some], good[some]
             )
-        return Lessons(seen, tried, good)
+        return Lessons(seen, good)
 
     def try_actions(
         self,

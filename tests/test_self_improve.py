@@ -108,7 +108,6 @@ def test_best_actions_are_those_after_which_all_is_visited_soonest(half_trained,
     n_good = []
     for row, (time, problem) in enumerate(zip(times, problems, strict=True)):
         likely = np.sort(pupil.scores(seen[row : row + 1])[0].argsort()[-alternatives:])
-        assert np.flatnonzero(lessons.tried[row]).tolist() == likely.tolist()
         steps = {}
         for action in likely.tolist():
             commands = [*split_joint(joint[:time, problem], 2, 4), *split_joint([action], 2, 4)]
@@ -149,7 +148,7 @@ def played_by_hand(monkeypatch, lengths, good, **changes):
         )
         marked = np.zeros((len(seen), 16), np.bool_)
         marked[np.flatnonzero(rows >= 0), rows[rows >= 0]] = True
-        return Lessons(seen, np.ones_like(marked), marked)
+        return Lessons(seen, marked)
 
     monkeypatch.setattr(pupil, "episodes", episodes)
     monkeypatch.setattr(pupil, "best_actions", best_actions)
@@ -199,26 +198,6 @@ def test_a_policy_that_solves_nothing_is_refused(monkeypatch):
         pupil.play()
 
 
-def test_what_was_not_tried_is_not_taught(monkeypatch):
-    """The loss is minus the logarithm of the best actions' share among those that were tried."""
-    pupil = SelfImproved(
-        Args(**{**SMALL, "batch_size": 1, "mistakes_batch": 0}), SETTING, untrained()
-    )
-    tried, good = np.zeros((2, 1, 16), np.bool_)
-    tried[0, [2, 5, 9]] = good[0, [2, 9]] = True
-    seen = np.array([[0, 3, 1, 9, 0, 0]], np.float32)
-    pupil.kept.add(Lessons(seen, tried, good))
-    pupil.left = 1
-    scores = pupil.scores(seen)[0].astype(np.float64)
-    two, five, nine = np.exp(scores[[2, 5, 9]])
-    loss = pupil.lesson()
-    assert loss.item() == pytest.approx(-np.log((two + nine) / (two + five + nine)), abs=1e-6)
-    loss.backward()
-    gradient = pupil.network.head.advantages.bias.grad
-    assert gradient.isfinite().all()
-    assert gradient.abs().sum() > 0
-
-
 def test_loss_is_the_probability_of_a_good_action():
     """Minus its logarithm, by hand: two of four actions are good."""
     scores = torch.log(torch.tensor([[0.1, 0.2, 0.3, 0.4]]))
@@ -251,14 +230,13 @@ def test_a_full_memory_forgets_the_oldest(at_a_time):
     for first in range(0, 3 * at_a_time, at_a_time):
         numbers = np.arange(first, first + at_a_time) % 16
         marks = np.eye(16, dtype=np.bool_)[numbers]
-        newest.add(Lessons(np.repeat(numbers[:, None], 6, axis=1), ~marks, marks))
+        newest.add(Lessons(np.repeat(numbers[:, None], 6, axis=1), marks))
     other = NewestLessons(5, pupil.spec)
     other.restore(newest.arrays())
     expected = sorted(n % 16 for n in range(3 * at_a_time - 5, 3 * at_a_time))
     for lessons in (newest, other):
         assert sorted(lessons.rows.seen[:, 0]) == expected
         assert sorted(lessons.rows.good.argmax(axis=1)) == expected
-        assert sorted(lessons.rows.tried.argmin(axis=1)) == expected
         assert set(lessons.draw(50, pupil.rng).seen[:, 0]) == set(expected)
 
 
