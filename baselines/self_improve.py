@@ -2,11 +2,11 @@
 
 Method: policy iteration by classification (Lagoudakis and Parr 2003). The policy plays random
 problems in the batched environment, greedily but for a few random steps. In each state that it
-comes to, its likeliest joint actions are tried, side by side: the episode is played again up to
-there, then the action, then on greedily until all is visited. Those after which that was soonest
-are what the network is taught in this state, all alike. States in which the greedy action was none
-of them are taught more often, and their problems come again. It is the slowly moving average of the
-network that plays, since what it finds must not be worse than what is there.
+comes to, its likeliest joint actions and a few others are tried, side by side: the episode is
+played again up to there, then the action, then on greedily until all is visited. Those after which
+that was soonest are what the network is taught in this state, all alike. States in which the greedy
+action was none of them are taught more often, and their problems come again. It is the slowly
+moving average of the network that plays, since what it finds must not be worse than what is there.
 
 This is reinforcement learning by trial alone: all that is known of a problem is how long one's own
 episodes on it took, never the optimum, and walls are met by bumping into them. As many problems are
@@ -70,8 +70,10 @@ class Args(ImitationOptions):
     """at most so many of them are problems on which a mistake was made before"""
     exploration: float = 0.1
     """probability that an episode goes on with a random joint action"""
-    alternatives: int = 16
+    alternatives: int = 12
     """likeliest joint actions that are tried in each state"""
+    others: int = 4
+    """random other joint actions that are tried besides"""
     max_length: int = 16
     """steps after which an episode is given up"""
     updates_per_round: int = 16
@@ -97,6 +99,7 @@ class Args(ImitationOptions):
         check_count("played_again", self.played_again, 0, self.problems)
         check_number("exploration", self.exploration, 0.0, 1.0)
         check_count("alternatives", self.alternatives, 2, 1024)
+        check_count("others", self.others, 0, 1024)
         check_count("max_length", self.max_length, 1, 1_000_000)
         check_count("updates_per_round", self.updates_per_round, 1, 65_536)
         check_count("batch_size", self.batch_size, 1, 65_536)
@@ -175,7 +178,7 @@ class SelfImproved(Pupil):
             raise ValueError("policy must be a meta-agent's with joint values (--outputs joint)")
         super().__init__(args, network, np.random.default_rng(args.seed))
         self.player = copy.deepcopy(network).requires_grad_(False)  # the average
-        self.n_tried = min(args.alternatives, self.spec.n_joint_actions)
+        self.n_tried = min(args.alternatives + args.others, self.spec.n_joint_actions)
         self.cells = setting.grid.reachable
         self.envs = make_vec(
             args.problems * self.n_tried,
@@ -274,7 +277,7 @@ class SelfImproved(Pupil):
         problems: np.ndarray,
         seen: np.ndarray,
     ) -> Lessons:
-        """Return after which of the likeliest actions all is visited soonest, going on greedily.
+        """Return after which of the tried actions all is visited soonest, going on greedily.
 
         Parameters
         ----------
@@ -291,14 +294,22 @@ class SelfImproved(Pupil):
             None is good in a state after which ``max_length`` was never enough.
         """
         scores = self.scores(seen)
-        likeliest = np.argpartition(scores, -self.n_tried, axis=1)[:, -self.n_tried :]
+        tried = self.tried(scores)
         good = np.zeros(scores.shape, np.bool_)
         for first in range(0, len(times), self.args.problems):
             some = slice(first, first + self.args.problems)
-            self.try_actions(
-                landmarks, joint, times[some], problems[some], likeliest[some], good[some]
-            )
+            self.try_actions(landmarks, joint, times[some], problems[some], tried[some], good[some])
         return Lessons(seen, good)
+
+    def tried(self, scores: np.ndarray) -> np.ndarray:
+        """Return the likeliest joint actions and random others: (S, n_tried).
+
+        The others, since what is never tried is never found. Of scores (S, A ** N).
+        """
+        order = np.argsort(-scores, axis=1)
+        n_likeliest = min(self.args.alternatives, self.n_tried)
+        rest = self.rng.permuted(order[:, n_likeliest:], axis=1)
+        return np.concatenate((order[:, :n_likeliest], rest), axis=1)[:, : self.n_tried]
 
     def try_actions(
         self,

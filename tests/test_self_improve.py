@@ -32,7 +32,8 @@ SMALL = {
     "learning_rate": 0.005,
     "evaluation_problems": 0,
     "sharpness": 1.0,
-    "alternatives": 6,
+    "alternatives": 4,
+    "others": 2,
     "averaging": 0.02,
 }
 
@@ -95,8 +96,8 @@ def test_episodes_are_what_the_rules_make_of_them(half_trained, exploration):
 @pytest.mark.parametrize("alternatives", [2, 7, 16])
 def test_best_actions_are_those_after_which_all_is_visited_soonest(half_trained, alternatives):
     """Of the likeliest actions; found again one by one, through the rules of the scalar env."""
-    changes = {"problems": 6, "alternatives": alternatives, "played_again": 5, "exploration": 0.3}
-    pupil = SelfImproved(Args(**{**SMALL, **changes}), SETTING, half_trained)
+    changes = {"problems": 6, "alternatives": alternatives, "others": 0, "played_again": 5}
+    pupil = SelfImproved(Args(**{**SMALL, **changes, "exploration": 0.3}), SETTING, half_trained)
     env = mapp_v0.parallel_env(GRID, 2, 2, pupil.args.max_length)
     landmarks = unseen_problems(SETTING, 6)
     observations, joint, lengths = pupil.episodes(landmarks)
@@ -128,6 +129,24 @@ def test_best_actions_are_those_after_which_all_is_visited_soonest(half_trained,
         n_good.append(len(expected))
     assert 0 in n_good or alternatives == 16
     assert max(n_good) > 1
+
+
+@pytest.mark.parametrize(("alternatives", "others"), [(4, 2), (5, 0), (16, 3), (2, 20)])
+def test_the_likeliest_are_tried_and_random_others(alternatives, others):
+    """Each once; all others have their turn sooner or later."""
+    args = Args(**{**SMALL, "alternatives": alternatives, "others": others})
+    pupil = SelfImproved(args, SETTING, untrained())
+    scores = np.random.default_rng(0).normal(size=(2000, 16)).astype(np.float32)
+    tried = pupil.tried(scores)
+    assert tried.shape == (2000, min(alternatives + others, 16))
+    assert (np.diff(np.sort(tried, axis=1), axis=1) > 0).all()
+    ranks = np.argsort(np.argsort(-scores, axis=1), axis=1)
+    chosen = np.take_along_axis(ranks, tried, axis=1)
+    assert (np.sort(chosen, axis=1)[:, :alternatives] == np.arange(min(alternatives, 16))).all()
+    if others:
+        counts = np.bincount(chosen.ravel(), minlength=16)[alternatives:]
+        expected = 2000 * min(others / (16 - alternatives), 1) if alternatives < 16 else 0
+        np.testing.assert_allclose(counts, expected, rtol=0.2)
 
 
 def played_by_hand(monkeypatch, lengths, good, **changes):
