@@ -54,8 +54,8 @@ class Args:
     )
     """learners to compare: one network commands all agents, each agent has its own, or all use one
     by themselves"""
-    default_updates: int = 40
-    """updates after each episode under the preset default; 40 are its own"""
+    default_updates: int = 32
+    """updates after each episode under the preset default; 32 are its own"""
     seeds: int = 5
     """trainings of each: seeds 0, 1, 2 ..."""
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)

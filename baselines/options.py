@@ -86,7 +86,7 @@ class Options:
     """states in an update"""
     learning_starts: int = 500
     """steps played before the first update"""
-    updates_per_episode: int = 40
+    updates_per_episode: int = 32
     """updates after each episode"""
     update_interval: int = 0
     """steps played between two updates; 0 for none but those after episodes"""
