@@ -1,12 +1,14 @@
 """Improve a trained policy by trying, in the states it comes to, what else it might have done.
 
 Method: policy iteration by classification (Lagoudakis and Parr 2003). The policy plays random
-problems in the batched environment, greedily but for a few random steps. In each state that it
-comes to, its likeliest joint actions and a few others are tried, side by side: the episode is
-played again up to there, then the action, then on greedily until all is visited. Those after which
-that was soonest are what the network is taught in this state, all alike. States in which the greedy
-action was none of them are taught more often, and their problems come again. It is the slowly
-moving average of the network that plays, since what it finds must not be worse than what is there.
+problems in the batched environment, greedily but for a few random steps. In each state of some of
+them, its likeliest joint actions and a few others are tried, side by side: the episode is played
+again up to there, then the action, then on greedily until all is visited. Those after which that
+was soonest are what the network is taught in this state, all alike. States in which the greedy
+action was none of them are taught besides, and their problems come again. Trying takes long, and
+few states are soon learned by heart: so in all other states that were passed, of which there are
+many more, the network is taught what it does already, as the slowly moving average of it says. It
+is also this average that plays.
 
 This is reinforcement learning by trial alone: all that is known of a problem is how long one's own
 episodes on it took, never the optimum, and walls are met by bumping into them. As many problems are
@@ -31,7 +33,7 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
-from torch import Tensor
+from torch import Tensor, nn
 
 from baselines.checkpoints import part
 from baselines.checks import check_count, check_number
@@ -60,14 +62,16 @@ class Args(ImitationOptions):
 
     policy: str | None = None
     """a meta-agent with joint values to start from: a run folder, or a pretrained policy's name"""
-    learning_rate: float = 0.001
+    learning_rate: float = 0.0003
     """step size of Adam; it falls in a straight line to 0"""
     weight_decay: float = 0.1
     """share of every weight, times the step size, that each update takes off it"""
-    problems: int = 128
+    problems: int = 1024
     """random problems that are played at a time"""
+    tried_problems: int = 128
+    """so many of them in whose states other actions are tried"""
     played_again: int = 32
-    """at most so many of them are problems on which a mistake was made before"""
+    """at most so many of those are problems on which a mistake was made before"""
     exploration: float = 0.1
     """probability that an episode goes on with a random joint action"""
     alternatives: int = 12
@@ -78,15 +82,17 @@ class Args(ImitationOptions):
     """steps after which an episode is given up"""
     updates_per_round: int = 16
     """updates after each time"""
-    batch_size: int = 512
-    """states in an update"""
+    batch_size: int = 384
+    """states in an update of all that were passed"""
+    tried_batch: int = 128
+    """states in an update besides, of those in which other actions were tried"""
     mistakes_batch: int = 128
     """states in an update besides, of those in which the greedy action was a mistake"""
-    learning_starts: int = 30_000
+    learning_starts: int = 20_000
     """states that are tried before the first update"""
-    kept_states: int = 300_000
+    kept_states: int = 100_000
     """states that are kept to be taught, the newest"""
-    kept_mistakes: int = 20_000
+    kept_mistakes: int = 5_000
     """mistakes that are kept, the newest"""
     averaging: float = 0.001
     """how far the average of the network goes towards the network with each update"""
@@ -96,13 +102,15 @@ class Args(ImitationOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("problems", self.problems, 1, 65_536)
-        check_count("played_again", self.played_again, 0, self.problems)
+        check_count("tried_problems", self.tried_problems, 1, self.problems)
+        check_count("played_again", self.played_again, 0, self.tried_problems)
         check_number("exploration", self.exploration, 0.0, 1.0)
         check_count("alternatives", self.alternatives, 2, 1024)
         check_count("others", self.others, 0, 1024)
         check_count("max_length", self.max_length, 1, 1_000_000)
         check_count("updates_per_round", self.updates_per_round, 1, 65_536)
         check_count("batch_size", self.batch_size, 1, 65_536)
+        check_count("tried_batch", self.tried_batch, 0, 65_536)
         check_count("mistakes_batch", self.mistakes_batch, 0, 65_536)
         check_count("learning_starts", self.learning_starts, 0, 10_000_000)
         check_count("kept_states", self.kept_states, 1, 10_000_000)
@@ -181,7 +189,7 @@ class SelfImproved(Pupil):
         self.n_tried = min(args.alternatives + args.others, self.spec.n_joint_actions)
         self.cells = setting.grid.reachable
         self.envs = make_vec(
-            args.problems * self.n_tried,
+            max(args.problems, args.tried_problems * self.n_tried),
             autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
             grid=setting.grid,
             n_agents=setting.n_agents,
@@ -191,11 +199,12 @@ class SelfImproved(Pupil):
         self.envs.reset(seed=args.seed)  # each later problem is given, so nothing of it is random
         self.kept = NewestLessons(args.kept_states, self.spec)
         self.mistakes = NewestLessons(args.kept_mistakes, self.spec)
+        self.passed = np.zeros((0, self.spec.observation_size), np.float32)  # in the last round
         self.again = np.zeros((0, self.spec.n_landmarks), np.int64)  # problems to be played again
         self.left = 0  # updates until the next round
 
     def lesson(self) -> Tensor:
-        """Return the loss on states of past rounds; play a new round when it is time."""
+        """Return the loss on states of the last rounds; play a new round when it is time."""
         args = self.args
         if self.left == 0:
             self.play()
@@ -203,11 +212,18 @@ class SelfImproved(Pupil):
                 self.play()
             self.left = args.updates_per_round
         self.left -= 1
-        usual = self.kept.draw(args.batch_size, self.rng)
+        passed = self.passed[self.rng.integers(len(self.passed), size=args.batch_size)]
+        tried = self.kept.draw(args.tried_batch, self.rng)
         mistakes = self.mistakes.draw(args.mistakes_batch, self.rng)
-        both = (np.concatenate(arrays) for arrays in zip(usual, mistakes, strict=True))
-        seen, good = map(torch.from_numpy, both)
-        return good_actions_loss(self.network(seen), good)
+        seen = torch.from_numpy(np.concatenate((passed, tried.seen, mistakes.seen)))
+        good = torch.from_numpy(np.concatenate((tried.good, mistakes.good)))
+        scores = self.network(seen)
+        with torch.no_grad():
+            usual = self.player(seen[: len(passed)]).softmax(1)
+        losses = nn.functional.cross_entropy(scores[: len(passed)], usual) * len(passed)
+        if len(good):
+            losses = losses + good_actions_loss(scores[len(passed) :], good) * len(good)
+        return losses / len(seen)
 
     def update(self) -> None:
         """Learn from one batch, and move the average."""
@@ -224,7 +240,9 @@ class SelfImproved(Pupil):
         again = self.again[: args.played_again]
         landmarks[: len(again)] = again
         seen, joint, lengths = self.episodes(landmarks)
-        times, problems = np.nonzero(np.arange(len(seen))[:, None] < lengths)
+        visited = np.arange(len(seen))[:, None] < lengths
+        self.passed = seen[visited]
+        times, problems = np.nonzero(visited[:, : args.tried_problems])
         seen = seen[times, problems]
         lessons = self.best_actions(landmarks, joint, times, problems, seen)
         greedy = self.scores(seen).argmax(axis=1)
@@ -296,8 +314,8 @@ class SelfImproved(Pupil):
         scores = self.scores(seen)
         tried = self.tried(scores)
         good = np.zeros(scores.shape, np.bool_)
-        for first in range(0, len(times), self.args.problems):
-            some = slice(first, first + self.args.problems)
+        for first in range(0, len(times), self.args.tried_problems):
+            some = slice(first, first + self.args.tried_problems)
             self.try_actions(landmarks, joint, times[some], problems[some], tried[some], good[some])
         return Lessons(seen, good)
 
@@ -320,7 +338,10 @@ class SelfImproved(Pupil):
         tried: np.ndarray,
         good: np.ndarray,
     ) -> None:
-        """Mark in `good` which of the tried actions (S, n_tried) are best, S at most `problems`."""
+        """Mark in `good` which of the tried actions (S, n_tried) are best.
+
+        There are at most `tried_problems` states.
+        """
         # An environment for each state and action.
         index = np.repeat(np.arange(len(times)), self.n_tried)
         action, time, problem = tried.ravel(), times[index], problems[index]
@@ -364,7 +385,11 @@ class SelfImproved(Pupil):
             "player": {name: t.numpy() for name, t in self.player.state_dict().items()},
             "kept": self.kept.arrays(),
             "mistakes": self.mistakes.arrays(),
-            "round": {"again": self.again, "left": np.array(self.left)},
+            "round": {
+                "again": self.again,
+                "left": np.array(self.left),
+                "passed": self.passed,
+            },
         }
 
     def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
@@ -374,6 +399,7 @@ class SelfImproved(Pupil):
         self.kept.restore(part(arrays, "kept"))
         self.mistakes.restore(part(arrays, "mistakes"))
         self.again, self.left = arrays["round.again"].copy(), int(arrays["round.left"])
+        self.passed = arrays["round.passed"].copy()
 
 
 def sharpen(network: Network, factor: float) -> None:

@@ -21,10 +21,12 @@ from mapp_env import Grid, Problem, mapp_v0, replay
 GRID = Grid.from_text("....\n.#D.\n..#.\n....")
 SETTING = Setting(GRID, 2, 2, 20)
 SMALL = {
-    "problems": 40,
+    "problems": 60,
+    "tried_problems": 40,
     "played_again": 10,
     "updates_per_round": 8,
     "batch_size": 32,
+    "tried_batch": 32,
     "mistakes_batch": 32,
     "learning_starts": 50,
     "kept_states": 500,
@@ -96,7 +98,13 @@ def test_episodes_are_what_the_rules_make_of_them(half_trained, exploration):
 @pytest.mark.parametrize("alternatives", [2, 7, 16])
 def test_best_actions_are_those_after_which_all_is_visited_soonest(half_trained, alternatives):
     """Of the likeliest actions; found again one by one, through the rules of the scalar env."""
-    changes = {"problems": 6, "alternatives": alternatives, "others": 0, "played_again": 5}
+    changes = {
+        "problems": 6,
+        "alternatives": alternatives,
+        "others": 0,
+        "tried_problems": 5,
+        "played_again": 5,
+    }
     pupil = SelfImproved(Args(**{**SMALL, **changes, "exploration": 0.3}), SETTING, half_trained)
     env = mapp_v0.parallel_env(GRID, 2, 2, pupil.args.max_length)
     landmarks = unseen_problems(SETTING, 6)
@@ -152,7 +160,9 @@ def test_the_likeliest_are_tried_and_random_others(alternatives, others):
 def played_by_hand(monkeypatch, lengths, good, **changes):
     """Return a pupil whose episodes and best actions are given: greedy is always action 0."""
     pupil = SelfImproved(
-        Args(**{**SMALL, "problems": len(lengths), **changes}), SETTING, untrained()
+        Args(**{**SMALL, "problems": len(lengths), "tried_problems": len(lengths), **changes}),
+        SETTING,
+        untrained(),
     )
     seen = np.arange(3 * len(lengths), dtype=np.float32).reshape(3, -1, 1).repeat(6, axis=2)
     played = []
