@@ -35,7 +35,8 @@ from baselines.imitation import (
     own_options,
     run_imitation,
 )
-from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
+from baselines.networks import Network, NetworkSpec, build_network, split_joint, torch_generator
+from baselines.policy import load_policy
 from baselines.settings import N_ACTIONS, Setting, find_grid, read_setting
 from mapp_env import Grid
 
@@ -69,6 +70,8 @@ class Args(ImitationOptions):
     route_units: int = 16
     """numbers that describe an agent among pairs of landmarks"""
 
+    policy: str | None = None
+    """a distilled policy to go on from, with the same network: a run folder, or a name"""
     batch_size: int = 512
     """states in an update"""
     asked_again: int = 128
@@ -99,7 +102,7 @@ class Distilled(Pupil):
 
     args: Args
 
-    def __init__(self, args: Args, grid: Grid) -> None:
+    def __init__(self, args: Args, grid: Grid, start: Network | None = None) -> None:
         if grid.n_cells > MAX_CELLS:
             raise ValueError(f"grid must have at most {MAX_CELLS:,} cells, got {grid.n_cells:,}")
         check_count("n_landmarks", args.n_landmarks, 1, grid.reachable.size)
@@ -116,7 +119,9 @@ class Distilled(Pupil):
             landmark_units=args.landmark_units,
             route_units=args.route_units,
         )
-        network = build_network(spec, torch_generator(seeds))
+        network = start or build_network(spec, torch_generator(seeds))
+        if network.spec != spec:
+            raise ValueError(f"policy must have the network {spec}, got {network.spec}")
         super().__init__(args, network, np.random.default_rng(states))
         self.states = ImaginedReplay(
             *(spec, grid.depot, args.batch_size, 1, 1.0, 0.0),
@@ -166,8 +171,11 @@ def main(args: Args) -> int:
         setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
     else:
         setting, _ = read_setting(args.resume)
+    # A resumed run has what it started from in its own folder, until it has something better.
+    policy = args.policy and (args.resume or args.policy)
+    start = load_policy(policy).network.train() if policy else None
     grid = setting.grid
-    return run_imitation(args, ALGORITHM, setting, lambda: Distilled(args, grid), [])
+    return run_imitation(args, ALGORITHM, setting, lambda: Distilled(args, grid, start), [])
 
 
 if __name__ == "__main__":
