@@ -1,6 +1,5 @@
-"""Self-improvement: what is taught is what turned out best among what was tried, and it helps."""
+"""Self-improvement: what is taught is the shortest of one's own episodes, and it helps."""
 
-import copy
 import json
 import os
 import signal
@@ -9,34 +8,28 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import distill, imitation, self_improve
-from baselines.distill import Distilled
+from baselines import imitation, self_improve
 from baselines.evaluation import evaluate, find_optima, unseen_problems
 from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
 from baselines.policy import NetworkPolicy, load_policy, save_policy
-from baselines.self_improve import Args, Lessons, NewestLessons, SelfImproved
+from baselines.self_improve import Args, Lessons, SelfImproved
 from baselines.settings import Setting
 from mapp_env import Grid, Problem, mapp_v0, replay
 
 GRID = Grid.from_text("....\n.#D.\n..#.\n....")
 SETTING = Setting(GRID, 2, 2, 20)
 SMALL = {
-    "problems": 60,
-    "tried_problems": 40,
+    "problems": 40,
     "played_again": 10,
+    "episodes": 6,
     "updates_per_round": 8,
     "batch_size": 32,
-    "tried_batch": 32,
-    "mistakes_batch": 32,
-    "learning_starts": 50,
+    "kept_batch": 32,
     "kept_states": 500,
-    "kept_mistakes": 100,
     "learning_rate": 0.005,
     "evaluation_problems": 0,
     "sharpness": 1.0,
     "alternatives": 4,
-    "others": 2,
-    "averaging": 0.02,
 }
 
 
@@ -44,16 +37,6 @@ def untrained(outputs: str = "joint"):
     """Return a network that has learned nothing."""
     spec = NetworkSpec("pairs", 2, 2, 4, 16, 32, outputs, dueling=True, code_units=16)
     return build_network(spec, torch_generator(np.random.SeedSequence(0)))
-
-
-@pytest.fixture(scope="module")
-def half_trained():
-    """Return a network that solves some problems, not all of them in the best way."""
-    options = {"n_agents": 2, "n_landmarks": 2, "hidden_units": 32, "code_units": 16}
-    pupil = Distilled(distill.Args(**options, batch_size=64, updates=1000), GRID)
-    for _ in range(60):
-        pupil.update()
-    return pupil.network
 
 
 @pytest.fixture
@@ -71,160 +54,102 @@ def folder(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("exploration", [0.0, 0.4])
-def test_episodes_are_what_the_rules_make_of_them(half_trained, exploration):
-    """Lengths are those of replayed actions, which are greedy but for the share that explores."""
-    pupil = SelfImproved(Args(**{**SMALL, "exploration": exploration}), SETTING, half_trained)
-    landmarks = unseen_problems(SETTING, 40)
+def test_episodes_are_what_the_rules_make_of_them():
+    """Lengths are those of replayed actions; every so-many-th episode is the greedy policy's."""
+    pupil = SelfImproved(Args(**SMALL), SETTING, untrained())
+    drawn = unseen_problems(SETTING, 40)
+    landmarks = np.repeat(drawn, 6, axis=0)
     observations, joint, lengths = pupil.episodes(landmarks)
     actions = split_joint(joint, 2, 4)
-    given_up = greedy = played = 0
-    for row, length in enumerate(lengths):
+    unsolved = lengths > pupil.args.max_length
+    assert 0 < unsolved.sum() < len(lengths)
+    for row in range(len(lengths)):
         problem = Problem(GRID, landmarks[row].tolist(), 2)
-        plan = replay(problem, actions[:length, row])
-        assert plan.cover_time == length if plan.success else length == pupil.args.max_length
-        given_up += not plan.success
-        assert not observations[length:, row].any()
-        assert observations[:length, row, 2:4].tolist() == [landmarks[row].tolist()] * length
-        best = pupil.scores(observations[:length, row]).argmax(axis=1)
-        greedy += (best == joint[:length, row]).sum()
-        played += length
-    assert 0 < given_up < 40
-    # A random action is the greedy one in a sixteenth of the cases.
-    assert greedy / played == pytest.approx(1 - exploration * 15 / 16, abs=0.08)
-    assert exploration or greedy == played
+        played = replay(problem, actions[: min(lengths[row], len(actions)), row])
+        assert played.success == (not unsolved[row])
+        if played.success:
+            assert played.cover_time == lengths[row]
+            assert not observations[lengths[row] :, row].any()
+    with torch.inference_mode():
+        for step, seen in enumerate(observations):
+            going_on = np.flatnonzero((np.arange(len(lengths)) % 6 == 0) & (lengths > step))
+            greedy = pupil.network(torch.from_numpy(seen[going_on])).argmax(1).numpy()
+            np.testing.assert_array_equal(joint[step, going_on], greedy)
+    assert len(np.unique(joint[0, 1:6])) > 1  # the others are drawn
 
 
-@pytest.mark.parametrize("alternatives", [2, 7, 16])
-def test_best_actions_are_those_after_which_all_is_visited_soonest(half_trained, alternatives):
-    """Of the likeliest actions; found again one by one, through the rules of the scalar env."""
-    changes = {
-        "problems": 6,
-        "alternatives": alternatives,
-        "others": 0,
-        "tried_problems": 5,
-        "played_again": 5,
-    }
-    pupil = SelfImproved(Args(**{**SMALL, **changes, "exploration": 0.3}), SETTING, half_trained)
-    env = mapp_v0.parallel_env(GRID, 2, 2, pupil.args.max_length)
-    landmarks = unseen_problems(SETTING, 6)
-    observations, joint, lengths = pupil.episodes(landmarks)
-    times, problems = np.nonzero(np.arange(len(observations))[:, None] < lengths)
-    seen = observations[times, problems]
-    lessons = pupil.best_actions(landmarks, joint, times, problems, seen)
-    assert len(lessons.seen) == len(seen) > 30
-    policy = NetworkPolicy(pupil.network)
-    n_good = []
-    for row, (time, problem) in enumerate(zip(times, problems, strict=True)):
-        likely = np.sort(pupil.scores(seen[row : row + 1])[0].argsort()[-alternatives:])
-        steps = {}
-        for action in likely.tolist():
-            commands = [*split_joint(joint[:time, problem], 2, 4), *split_joint([action], 2, 4)]
-            here, _ = env.reset(options={"landmarks": landmarks[problem].tolist()})
-            step = 0
-            while env.agents:
-                if step >= len(commands):
-                    commands.append(policy.act(here["agent_0"][None])[0])
-                if step == time:
-                    np.testing.assert_array_equal(here["agent_0"], seen[row])
-                chosen = dict(zip(env.agents, commands[step].tolist(), strict=True))
-                here, _, terminated, _, _ = env.step(chosen)
-                step += 1
-            steps[action] = step if terminated["agent_0"] else 99
-        least = min(min(steps.values()), 98)
-        expected = [action for action, count in steps.items() if count == least]
-        assert np.flatnonzero(lessons.good[row]).tolist() == expected
-        n_good.append(len(expected))
-    assert 0 in n_good or alternatives == 16
-    assert max(n_good) > 1
-
-
-@pytest.mark.parametrize(("alternatives", "others"), [(4, 2), (5, 0), (16, 3), (2, 20)])
-def test_the_likeliest_are_tried_and_random_others(alternatives, others):
-    """Each once; all others have their turn sooner or later."""
-    args = Args(**{**SMALL, "alternatives": alternatives, "others": others})
+def test_the_shortest_episode_is_taught(monkeypatch):
+    """Of equally short ones the greedy one; only what is shorter than the greedy one is kept."""
+    args = Args(**{**SMALL, "problems": 3, "episodes": 3, "max_length": 4, "played_again": 1})
     pupil = SelfImproved(args, SETTING, untrained())
-    scores = np.random.default_rng(0).normal(size=(2000, 16)).astype(np.float32)
-    tried = pupil.tried(scores)
-    assert tried.shape == (2000, min(alternatives + others, 16))
-    assert (np.diff(np.sort(tried, axis=1), axis=1) > 0).all()
-    ranks = np.argsort(np.argsort(-scores, axis=1), axis=1)
-    chosen = np.take_along_axis(ranks, tried, axis=1)
-    assert (np.sort(chosen, axis=1)[:, :alternatives] == np.arange(min(alternatives, 16))).all()
-    if others:
-        counts = np.bincount(chosen.ravel(), minlength=16)[alternatives:]
-        expected = 2000 * min(others / (16 - alternatives), 1) if alternatives < 16 else 0
-        np.testing.assert_allclose(counts, expected, rtol=0.2)
+    # Problem 0: all alike; 1: the third is shortest; 2: nobody has solved it.
+    lengths = np.array([2, 2, 2, 4, 3, 1, 5, 5, 5])
+    joint = np.arange(4 * 9).reshape(4, 9) % 16
+    seen = np.repeat(np.arange(36, dtype=np.float32).reshape(4, 9, 1), 6, axis=2)
+    asked = []
 
+    def as_good(landmarks, observations, joint, lengths, chosen):
+        asked.append(np.argwhere(chosen).tolist())
+        return Lessons(observations[chosen], np.ones((chosen.sum(), 16), bool))
 
-def played_by_hand(monkeypatch, lengths, good, **changes):
-    """Return a pupil whose episodes and best actions are given: greedy is always action 0."""
-    pupil = SelfImproved(
-        Args(**{**SMALL, "problems": len(lengths), "tried_problems": len(lengths), **changes}),
-        SETTING,
-        untrained(),
-    )
-    seen = np.arange(3 * len(lengths), dtype=np.float32).reshape(3, -1, 1).repeat(6, axis=2)
-    played = []
-
-    def episodes(landmarks):
-        played.append(landmarks.tolist())
-        return seen, np.zeros(seen.shape[:2], np.int64), np.array(lengths)
-
-    def best_actions(landmarks, joint, times, problems, seen):
-        rows = np.array(
-            [good[problem][time] for time, problem in zip(times, problems, strict=True)]
-        )
-        marked = np.zeros((len(seen), 16), np.bool_)
-        marked[np.flatnonzero(rows >= 0), rows[rows >= 0]] = True
-        return Lessons(seen, marked)
-
-    monkeypatch.setattr(pupil, "episodes", episodes)
-    monkeypatch.setattr(pupil, "best_actions", best_actions)
-    monkeypatch.setattr(pupil, "scores", lambda seen: np.eye(16)[np.zeros(len(seen), int)])
-    return pupil, played
-
-
-def test_what_is_kept_of_a_round(monkeypatch):
-    """States in which something is good; as mistakes those in which the greedy action is not."""
-    # Of each problem what is good in its states, -1 for nothing; the third state of 1 never was.
-    good = [[0, 3, 0], [0, 5], [-1, -1, 2]]
-    pupil, played = played_by_hand(monkeypatch, [3, 2, 3], good, played_again=1)
+    monkeypatch.setattr(pupil, "episodes", lambda landmarks: (seen, joint, lengths))
+    monkeypatch.setattr(pupil, "as_good", as_good)
     pupil.play()
-    kept, mistakes = (
-        lessons.rows.where(slice(len(lessons))) for lessons in (pupil.kept, pupil.mistakes)
-    )
-    assert sorted(kept.seen[:, 0]) == [0, 1, 3, 4, 6, 8]
-    assert sorted(zip(mistakes.seen[:, 0], mistakes.good.argmax(axis=1), strict=True)) == [
-        (3, 3),
-        (4, 5),
-        (8, 2),
-    ]
-    assert pupil.again.tolist() == played[0]
-
-
-def test_problems_come_again_until_nothing_is_mistaken(monkeypatch):
-    """Those with a mistake wait, the oldest first, and so many of them are played each time."""
-    good = [[0], [1], [2], [3]]
-    pupil, played = played_by_hand(monkeypatch, [1, 1, 1, 1], good, played_again=2)
-    pupil.play()
-    _, first, second, third = played[0]
-    assert pupil.again.tolist() == [first, second, third]
-    good[:] = [[0], [1], [0], [0]]
-    pupil.play()
-    assert played[1][:2] == [first, second]
-    assert pupil.again.tolist() == [third, second]
-    good[:] = [[0], [0], [0], [0]]
-    pupil.play()
-    assert played[2][:2] == [third, second]
-    assert not len(pupil.again)
-
-
-def test_a_policy_that_solves_nothing_is_refused(monkeypatch):
-    """Where no try ends, there is nothing to be taught."""
-    pupil, _ = played_by_hand(monkeypatch, [3], [[-1, -1, -1]], played_again=1)
+    assert pupil.lesson_states.seen[:, 0].tolist() == [0, 5, 9]
+    assert pupil.lesson_states.good.sum(axis=1).tolist() == [1, 1, 1]
+    taught = pupil.lesson_states.good.argmax(axis=1).tolist()
+    assert taught == [joint[0, 0], joint[0, 5], joint[1, 0]]
+    assert asked == [[[0, 1]]]
+    assert pupil.n_kept == 1
+    assert pupil.kept.seen[0, 0] == 5
+    # The one that nobody has solved comes again as well.
+    assert len(pupil.again) == 2
+    lengths[:] = 5
     with pytest.raises(ValueError, match="it solves no problem within max_length"):
         pupil.play()
+
+
+@pytest.mark.parametrize("alternatives", [1, 7, 16])
+def test_good_actions_are_those_that_are_as_short(alternatives):
+    """Of the likeliest actions just those after which the greedy policy is through in time.
+
+    Found again one by one, through the rules. The action that was taken always counts.
+    """
+    changes = {"problems": 5, "episodes": 40, "alternatives": alternatives, "played_again": 5}
+    pupil = SelfImproved(Args(**{**SMALL, **changes}), SETTING, untrained())
+    env = mapp_v0.parallel_env(GRID, 2, 2, 20)
+    landmarks = unseen_problems(SETTING, 5)
+    observations, joint, lengths = pupil.episodes(np.repeat(landmarks, 40, axis=0))
+    best = lengths.reshape(5, 40).argmin(axis=1) + 40 * np.arange(5)
+    observations, joint, lengths = observations[:, best], joint[:, best], lengths[best]
+    steps = np.arange(len(joint))[:, None]
+    chosen = (steps < lengths) & (lengths <= pupil.args.max_length)
+    lessons = pupil.as_good(landmarks, observations, joint, lengths, chosen)
+    room = pupil.envs.num_envs // alternatives
+    assert len(lessons.seen) == min(chosen.sum(), room)
+    policy = NetworkPolicy(pupil.network)
+    other = 0
+    for (time, problem), seen, good in zip(np.argwhere(chosen), *lessons, strict=False):
+        np.testing.assert_array_equal(seen, observations[time, problem])
+        assert good[joint[time, problem]]
+        with torch.inference_mode():
+            likely = pupil.network(torch.from_numpy(seen[None]))[0].topk(alternatives).indices
+        for action in range(16):
+            if action == joint[time, problem]:
+                continue
+            commands = [*split_joint(joint[:time, problem], 2, 4), *split_joint([action], 2, 4)]
+            here, _ = env.reset(options={"landmarks": landmarks[problem].tolist()})
+            for step in range(lengths[problem]):
+                if not env.agents:
+                    break
+                if step >= len(commands):
+                    commands.append(policy.act(here["agent_0"][None])[0])
+                chosen_actions = dict(zip(env.agents, commands[step].tolist(), strict=True))
+                here, _, terminated, _, _ = env.step(chosen_actions)
+            as_short = terminated["agent_0"]
+            assert good[action] == (as_short and action in likely.tolist())
+            other += good[action]
+    assert other or alternatives == 1
 
 
 def test_loss_is_the_probability_of_a_good_action():
@@ -234,44 +159,58 @@ def test_loss_is_the_probability_of_a_good_action():
     assert float(imitation.good_actions_loss(scores, good)) == pytest.approx(-np.log(0.6))
 
 
-def test_the_average_plays(half_trained):
-    """It starts as the network, goes a share of the way to it with each update, and scores."""
-    pupil = SelfImproved(Args(**{**SMALL, "averaging": 0.25}), SETTING, copy.deepcopy(half_trained))
-    seen = np.zeros((1, 6), np.float32)
-    mean = pupil.network.hidden.weight.detach().clone()
-    assert torch.equal(pupil.player.hidden.weight, mean)
-    for _ in range(3):
-        pupil.update()
-        mean += 0.25 * (pupil.network.hidden.weight.detach() - mean)
-        torch.testing.assert_close(pupil.player.hidden.weight, mean)
-    assert not torch.equal(pupil.network.hidden.weight, mean)
-    with torch.inference_mode():
-        scores = pupil.player(torch.from_numpy(seen)).numpy()
-    np.testing.assert_array_equal(pupil.scores(seen), scores)
+@pytest.mark.parametrize(("drawn", "bolder"), [(10, True), (11, True), (12, False)])
+def test_it_draws_as_boldly_as_it_should(monkeypatch, drawn, bolder):
+    """Where drawn episodes are hardly longer than greedy ones, the next ones are drawn bolder."""
+    args = Args(**{**SMALL, "problems": 2, "episodes": 2, "detour": 0.15, "played_again": 1})
+    pupil = SelfImproved(args, SETTING, untrained())
+    lengths = np.array([10, drawn, 10, drawn])
+    seen, joint = np.zeros((12, 4, 6), np.float32), np.zeros((12, 4), np.int64)
+    monkeypatch.setattr(pupil, "episodes", lambda landmarks: (seen, joint, lengths))
+    pupil.play()
+    assert (pupil.sharpness < 1) == bolder
 
 
-@pytest.mark.parametrize("at_a_time", [3, 7])
-def test_a_full_memory_forgets_the_oldest(at_a_time):
-    """The newest lessons are kept, as many as there is room for, and go through a checkpoint."""
-    pupil = SelfImproved(Args(**SMALL), SETTING, untrained())
-    newest = NewestLessons(5, pupil.spec)
-    assert not len(newest.draw(4, pupil.rng).seen)
-    for first in range(0, 3 * at_a_time, at_a_time):
-        numbers = np.arange(first, first + at_a_time) % 16
-        marks = np.eye(16, dtype=np.bool_)[numbers]
-        newest.add(Lessons(np.repeat(numbers[:, None], 6, axis=1), marks))
-    other = NewestLessons(5, pupil.spec)
-    other.restore(newest.arrays())
-    expected = sorted(n % 16 for n in range(3 * at_a_time - 5, 3 * at_a_time))
-    for lessons in (newest, other):
-        assert sorted(lessons.rows.seen[:, 0]) == expected
-        assert sorted(lessons.rows.good.argmax(axis=1)) == expected
-        assert set(lessons.draw(50, pupil.rng).seen[:, 0]) == set(expected)
+def test_problems_come_again_until_the_greedy_episode_is_shortest(monkeypatch):
+    """Those where it was not wait, the oldest first, and so many of them are played each time."""
+    args = Args(**{**SMALL, "problems": 4, "episodes": 2, "played_again": 2})
+    pupil = SelfImproved(args, SETTING, untrained())
+    seen, joint = np.zeros((9, 8, 6), np.float32), np.zeros((9, 8), np.int64)
+    played = []
+
+    def episodes(landmarks):
+        played.append(landmarks[::2].tolist())
+        return seen, joint, np.array(lengths)
+
+    monkeypatch.setattr(pupil, "episodes", episodes)
+    monkeypatch.setattr(pupil, "as_good", lambda *_: Lessons.of(0, pupil.spec))
+    lengths = [3, 2, 3, 3, 9, 1, 4, 2]
+    pupil.play()
+    first, second, third = (played[0][i] for i in (0, 2, 3))
+    assert pupil.again.tolist() == [first, second, third]
+    lengths = [3, 3, 3, 2, 3, 3, 3, 3]
+    pupil.play()
+    assert played[1][:2] == [first, second]
+    assert pupil.again.tolist() == [third, second]
+    lengths = [3, 3] * 4
+    pupil.play()
+    assert played[2][:2] == [third, second]
+    assert not len(pupil.again)
+
+
+def test_a_full_memory_forgets_the_oldest():
+    """The newest states are kept, as many as there is room for."""
+    pupil = SelfImproved(Args(**{**SMALL, "kept_states": 5}), SETTING, untrained())
+    for first in (0, 3, 6):
+        numbers = np.arange(first, first + 3)
+        pupil.keep(Lessons(np.repeat(numbers[:, None], 6, axis=1), np.eye(16, dtype=bool)[numbers]))
+    assert sorted(pupil.kept.good.argmax(axis=1)) == [4, 5, 6, 7, 8]
+    assert sorted(pupil.kept.seen[:, 0]) == [4, 5, 6, 7, 8]
 
 
 def test_it_improves(folder, tmp_path):
     """On a small grid, from an untrained policy, nearly all problems are solved optimally."""
-    args = Args(policy=str(folder), updates=1000, out=tmp_path / "run", **SMALL)
+    args = Args(policy=str(folder), updates=600, out=tmp_path / "run", **SMALL)
     problems = unseen_problems(SETTING, 78)
     optima = find_optima(SETTING, problems)
     before = evaluate(load_policy(folder), SETTING, problems, optima).summary()
