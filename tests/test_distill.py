@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import distill
+from baselines import distill, imitation
 from baselines.evaluation import Setting, evaluate, find_optima, unseen_problems
 from baselines.exact_values import steps_left
 from baselines.policy import load_policy
@@ -168,3 +168,29 @@ def test_stopped_and_resumed_is_the_same(tmp_path, monkeypatch):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     with pytest.raises(ValueError, match="leave out all others"):
         distill.main(distill.Args(resume=tmp_path / "run", seed=1))
+
+
+def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
+    """With its weights, to the bit, even if it is gone later; another network is refused."""
+    first, options = tmp_path / "first", {**SMALL, "updates": 10}
+    assert distill.main(distill.Args(out=first, **options, half_precision=False)) == 0
+    start = load_policy(first).network.state_dict()
+    with pytest.raises(ValueError, match="policy must have the network"):
+        distill.main(distill.Args(policy=str(first), **{**options, "hidden_units": 33}))
+    further = {**options, "policy": str(first), "seed": 1}
+    assert distill.main(distill.Args(out=tmp_path / "whole", **further)) == 0
+
+    def killed(pupil, *others):
+        for name, tensor in pupil.network.state_dict().items():
+            assert torch.equal(tensor, start[name])
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(imitation, "train", killed)
+        with pytest.raises(ZeroDivisionError):
+            distill.main(distill.Args(out=tmp_path / "run", **further))
+    for path in first.glob("*.*"):
+        path.unlink()
+    assert distill.main(distill.Args(resume=tmp_path / "run")) == 0
+    for name in ("metrics.csv", "policy.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
