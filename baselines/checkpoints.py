@@ -9,14 +9,14 @@ The last two are kept. Nothing is pickled, and no code is run from a file.
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors.numpy
 
-from baselines.runs import parse_json, read_bytes, write_atomically
+from baselines.runs import RunFolder, parse_json, read_bytes, write_atomically
 
 FOLDER = "checkpoints"
 FORMAT = "mapp_env checkpoint"
@@ -165,3 +165,44 @@ def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
     """Return the arrays whose names begin with a name and a dot, without these."""
     start = name + "."
     return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+
+
+def go_on(
+    run: RunFolder,
+    checkpoints: Checkpoints,
+    restore: Callable[[dict[str, np.ndarray], dict[str, Any]], None],
+) -> bool:
+    """Bring a run to its newest whole checkpoint, or to its start if there is none.
+
+    Parameters
+    ----------
+    run, checkpoints
+        The run's folder and its checkpoints.
+    restore
+        Takes over a checkpoint's arrays and state.
+
+    Returns
+    -------
+    bool
+        Whether there was a checkpoint.
+
+    Raises
+    ------
+    ValueError
+        If there are checkpoints but none can be used, or metrics.csv has changed.
+    """
+    checkpoint, problems = checkpoints.latest()
+    for problem in problems:
+        print(f"not used: {problem}")
+    if checkpoint is None:
+        run.restart()
+        print("no checkpoint had been written: from the start")
+        return False
+    try:
+        run.rewind(checkpoint.state["metrics"])
+        restore(checkpoint.arrays, checkpoint.state)
+    except (KeyError, TypeError, RuntimeError, IndexError) as error:
+        raise ValueError(
+            f"checkpoint {checkpoint.number} does not fit this run: {error}"
+        ) from error
+    return True

@@ -173,7 +173,7 @@ def main(args: Args) -> int:
         setting, _ = read_setting(args.resume)
     # A resumed run has what it started from in its own folder, until it has something better.
     policy = args.policy and (args.resume or args.policy)
-    start = load_policy(policy).network.train() if policy else None
+    start = load_policy(policy).network if policy else None
     grid = setting.grid
     return run_imitation(args, ALGORITHM, setting, lambda: Distilled(args, grid, start), [])
 

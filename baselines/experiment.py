@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checkpoints import Checkpoints
+from baselines.checkpoints import Checkpoints, go_on
 from baselines.evaluation import (
     EVALUATION_SEED,
     N_ROUTES,
@@ -188,8 +188,9 @@ def run_experiment(
         checkpoints = Checkpoints(folder, identity)
         if resumed is None:
             run.write_config(config)
-        else:
-            restore(training, run, checkpoints)
+        elif go_on(run, checkpoints, training.restore):
+            now = training.now
+            print(f"going on from episode {now.episodes + 1}, step {now.steps:,}")
         if n_evaluated < args.evaluation_problems:
             print(
                 f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there are "
@@ -232,31 +233,6 @@ def finish(
         save_table(folder, evaluations)
         print(f"\n{len(unseen):,} unseen problems:\n\n{format_table(evaluations)}")
         draw_routes(folder, {label: evaluations[label] for label in SAVED if label in evaluations})
-
-
-def restore(training: Training, run: RunFolder, checkpoints: Checkpoints) -> None:
-    """Bring a training to its newest whole checkpoint, or to its start if there is none.
-
-    Raises
-    ------
-    ValueError
-        If there are checkpoints but none can be used, or metrics.csv has changed.
-    """
-    checkpoint, problems = checkpoints.latest()
-    for problem in problems:
-        print(f"not used: {problem}")
-    if checkpoint is None:
-        run.restart()
-        print("no checkpoint had been written: from the start")
-        return
-    try:
-        run.rewind(checkpoint.state["metrics"])
-        training.restore(checkpoint.arrays, checkpoint.state)
-    except (KeyError, TypeError, RuntimeError, IndexError) as error:
-        raise ValueError(
-            f"checkpoint {checkpoint.number} does not fit this run: {error}"
-        ) from error
-    print(f"going on from episode {training.now.episodes + 1}, step {training.now.steps:,}")
 
 
 def read_options(kind: type[Options], folder: Path, algorithm: str) -> Options:

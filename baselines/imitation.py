@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checkpoints import Checkpoints, part
+from baselines.checkpoints import Checkpoints, go_on, part
 from baselines.checks import check_count, check_flag, check_number
 from baselines.evaluation import (
     count_unseen,
@@ -283,8 +283,8 @@ def run_imitation(
             # What it starts from, to the bit: it may have to start again.
             save_policy(run.path(WEIGHTS_FILE), pupil.network)
             run.write_config(identity)
-        else:
-            go_on(pupil, run, checkpoints)
+        elif go_on(run, checkpoints, pupil.restore):
+            print(f"going on from update {pupil.updates + 1:,}")
         with signals:
             train(pupil, run, checkpoints, signals)
         if signals.received is not None:
@@ -303,28 +303,3 @@ def run_imitation(
         run.close()
     print(f"\nrun folder: {folder}")
     return 0
-
-
-def go_on(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints) -> None:
-    """Bring a training to its newest whole checkpoint, or to its start if there is none.
-
-    Raises
-    ------
-    ValueError
-        If there are checkpoints but none can be used, or metrics.csv has changed.
-    """
-    checkpoint, problems = checkpoints.latest()
-    for problem in problems:
-        print(f"not used: {problem}")
-    if checkpoint is None:
-        run.restart()
-        print("no checkpoint had been written: from the start")
-        return
-    try:
-        run.rewind(checkpoint.state["metrics"])
-        pupil.restore(checkpoint.arrays, checkpoint.state)
-    except (KeyError, TypeError, RuntimeError, IndexError) as error:
-        raise ValueError(
-            f"checkpoint {checkpoint.number} does not fit this run: {error}"
-        ) from error
-    print(f"going on from update {pupil.updates + 1:,}")

@@ -1,5 +1,7 @@
 """What the network "pairs" looks up for an observation: numbers of rows in its tables."""
 
+import math
+
 import numpy as np
 from numba import njit  # type: ignore[import-untyped]
 
@@ -74,6 +76,11 @@ def routes(pairs, landmarks, n_cells):  # type: ignore[no-untyped-def]
                         out[row * n + agent, place] = cell * n_two + two
                 place += 1
     return out
+
+
+def n_routes(n_cells: int) -> int:
+    """Return how many rows :func:`routes` numbers."""
+    return n_cells * math.comb(n_cells, 2) + 1
 
 
 def between_landmarks(landmarks: np.ndarray, n_cells: int) -> np.ndarray:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from baselines.bags import Bag
 from baselines.checks import check_choice, check_count, check_flag
-from baselines.lookups import arrange, between_landmarks, routes
+from baselines.lookups import arrange, between_landmarks, n_routes, routes
 
 MAX_WEIGHTS = 20_000_000  # numbers in a network: 76 MiB
 MAX_JOINT_ACTIONS = 1024
@@ -112,8 +112,9 @@ class NetworkSpec:
             first += (self.n_inputs - self.observation_size) * hidden
             first += self.landmark_units * (self.n_agents * n_pairs + hidden)
             if self.route_units:
-                n_routes = self.n_cells * math.comb(self.n_cells, 2) + 1
-                first += self.route_units * (n_pairs + n_routes + self.n_agents * hidden)
+                first += self.route_units * (
+                    n_pairs + n_routes(self.n_cells) + self.n_agents * hidden
+                )
                 first += self.landmark_units * (self.n_cells + 1) ** 2
         return (self.n_agents if self.team == "independent" else 1) * (first + last)
 
@@ -215,8 +216,7 @@ class PairsNetwork(nn.Module):
         self.whose = Bag(n, spec.hidden_units, 0.1, generator) if spec.team == "shared" else None
         self.routes = self.between = None
         if spec.route_units:
-            n_routes = spec.n_cells * math.comb(spec.n_cells, 2) + 1
-            self.routes = Bag(n_routes, spec.route_units, 0.1, generator)
+            self.routes = Bag(n_routes(spec.n_cells), spec.route_units, 0.1, generator)
             if spec.landmark_units:
                 n_between = (spec.n_cells + 1) ** 2
                 self.between = Bag(n_between, spec.landmark_units, 0.1, generator)
