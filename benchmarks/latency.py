@@ -30,7 +30,7 @@ import torch
 
 from baselines.evaluation import Optima, evaluate, find_optima
 from baselines.guidance import Acting
-from baselines.policy import NearestLandmarkPolicy, load_policy, pretrained_names
+from baselines.policy import NearestLandmarkPolicy, NetworkPolicy, load_policy, pretrained_names
 from baselines.settings import Setting
 from mapp_env import Problem, make_grid, replay, sample_problems, solve
 from mapp_env.solvers import optimal_costs
@@ -107,6 +107,25 @@ def policy_rows(
     return [Row(f"{label}, one step", step, None, None), Row(label, whole, each, shortest)]
 
 
+def load_fitting(name: str) -> NetworkPolicy:
+    """Load a policy of the benchmark's setting.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or it is for another.
+    """
+    policy = load_policy(name)
+    for what, wanted in (
+        ("n_cells", SETTING.grid.n_cells),
+        ("n_agents", SETTING.n_agents),
+        ("n_landmarks", SETTING.n_landmarks),
+    ):
+        if getattr(policy.spec, what) != wanted:
+            raise ValueError(f"{name}: {what} must be {wanted}, got {getattr(policy.spec, what)}")
+    return policy
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -114,6 +133,10 @@ def main() -> None:
     parser.add_argument("--problems", type=int, default=100, help="one after another")
     parser.add_argument("--batch", type=int, default=20_000, help="handed over together")
     args = parser.parse_args()
+    try:
+        policies = {name: load_fitting(name) for name in args.policies}
+    except ValueError as error:
+        parser.error(f"--policies: {error}")
     torch.set_num_threads(1)
     grid, n_agents = SETTING.grid, SETTING.n_agents
     many = sample_problems(grid, args.batch, SETTING.n_landmarks, seed=1)
@@ -121,7 +144,7 @@ def main() -> None:
     optima = find_optima(SETTING, many)
     rows: list[Row] = []
     for name in args.policies:
-        rows += policy_rows(name, load_policy(name), problems, many, optima)
+        rows += policy_rows(name, policies[name], problems, many, optima)
     nearest = NearestLandmarkPolicy(grid, n_agents, SETTING.n_landmarks)
     rows += policy_rows("nearest landmark", nearest, problems, many, optima)[1:]
     solve(problems[0])
