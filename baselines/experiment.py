@@ -83,14 +83,14 @@ def train(
             progress.set_postfix(steps=row["steps"], reward=f"{reward:.0f}")
             progress.update()
             if training.now.episodes % args.episodes_per_problem == 0:
-                save_policy(run.path(WEIGHTS_FILE), learner.policy().network)
+                save_policy(run.path(WEIGHTS_FILE), learner.policy().network, args.half_precision)
             training.watch.lap("log and save")
         if time.monotonic() - saved >= args.checkpoint_seconds:
             save()
             saved = time.monotonic()
     progress.close()
     save()
-    save_policy(run.path(WEIGHTS_FILE), learner.policy().network)
+    save_policy(run.path(WEIGHTS_FILE), learner.policy().network, args.half_precision)
     training.watch.lap("log and save")
     run.write_json(
         TIMING_FILE,

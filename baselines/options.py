@@ -70,6 +70,8 @@ class Options:
     """whether the step size falls in a straight line to 0 over the episodes"""
     learning_rate_warmup: int = 200
     """updates over which the step size rises to its value"""
+    weight_decay: float = 0.0
+    """share of every weight, times the step size, that each update takes off it"""
     discount: float = 0.95
     """discount factor of future rewards"""
     reward_scale: float = 0.1
@@ -145,6 +147,8 @@ class Options:
     """seconds between two checkpoints; 0 for one after every step and update"""
     prefetch: bool = True
     """whether the next batch is prepared in a second thread; the weights are the same"""
+    half_precision: bool = False
+    """keep the policy's weights in 16 bits"""
     threads: int = 1
     """threads of PyTorch"""
 
@@ -155,7 +159,7 @@ class Options:
         check_choice("network", self.network, ("pairs", "paper"))
         check_choice("outputs", self.outputs, self.OUTPUTS)
         check_choice("replay", self.replay, self.REPLAYS)
-        for name in ("dueling", "double", "learning_rate_falls", "prefetch"):
+        for name in ("dueling", "double", "learning_rate_falls", "prefetch", "half_precision"):
             check_flag(name, getattr(self, name))
         for name, low, high in COUNTS:
             check_count(name, getattr(self, name), low, high)
@@ -197,6 +201,7 @@ COUNTS = (
 )
 NUMBERS = (
     ("learning_rate", 1e-12, 1.0),
+    ("weight_decay", 0.0, 1.0),
     ("discount", 0.0, 1.0),
     ("action_gap", 0.0, 1.0),
     ("reward_scale", 1e-6, 1e6),

@@ -91,7 +91,9 @@ class QLearner(ABC):
         self.weights = list(self.network.parameters())
         self.target_weights = list(self.target.parameters())
         # The fused step on a CPU is what needs torch 2.4.
-        self.optimiser = torch.optim.Adam(self.weights, lr=args.learning_rate, fused=True)
+        self.optimiser = torch.optim.AdamW(
+            self.weights, lr=args.learning_rate, weight_decay=args.weight_decay, fused=True
+        )
         self.rng = rng
         self.updates = 0
         self.prepared: tuple[Batch, Tensor] | None = None  # the next batch and its targets
