@@ -9,7 +9,7 @@ from typing import Any
 
 from numba import njit
 
-__all__ = ["kernel"]
+__all__ = ["cache_files", "cache_folders", "kernel"]
 
 
 def _digest_sources() -> str:
@@ -22,6 +22,7 @@ def _digest_sources() -> str:
 
 
 _SOURCES = _digest_sources()
+_KERNELS: list[Any] = []
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -41,4 +42,15 @@ def kernel(function: Callable[..., Any]) -> Any:
     function.__qualname__ = f"{name}_{_SOURCES}"
     compiled = njit(cache=True, forceinline=True, _nrt=False)(function)  # type: ignore[call-overload]
     function.__qualname__ = name
+    _KERNELS.append(compiled)
     return compiled
+
+
+def cache_folders() -> list[Path]:
+    """Return where compiled kernels are kept; nowhere if they are not compiled."""
+    return sorted({Path(one.stats.cache_path) for one in _KERNELS if hasattr(one, "stats")})
+
+
+def cache_files() -> list[Path]:
+    """Return the files of compiled code that the present sources have left there."""
+    return [path for folder in cache_folders() for path in sorted(folder.glob(f"*_{_SOURCES}-*"))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -219,10 +220,20 @@ class Plan:
         ValueError
             If the plan is not right (:meth:`verify`), too large, or the file cannot be written.
         """
+        write_record(path, "plan", self.to_record(), MAX_PLAN_BYTES)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plan and its problem as the fields of a file.
+
+        Raises
+        ------
+        ValueError
+            If the plan is not right (:meth:`verify`).
+        """
         problem, played = self._verify()
         # As played: what is equal but of another type, NumPy's integers say, is no JSON.
         columns = zip(*played.actions, strict=True) if played.actions else [()] * len(self.tours)
-        record = {
+        return {
             "problem": problem.to_record(),
             "objective": self.objective,
             "status": self.status,
@@ -235,7 +246,6 @@ class Plan:
             "claim_steps": played.claim_steps,
             "actions": ["".join(map(str, column)) for column in columns],
         }
-        write_record(path, "plan", record, MAX_PLAN_BYTES)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Plan:

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import mapp_env
-from mapp_env.commands import COMMANDS, main
+from mapp_env.commands import COMMANDS, main, render
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LANDMARKS = ["0", "6", "20", "42", "48"]
@@ -286,7 +286,7 @@ def test_commands_of_the_page_and_the_help_work(folder: Path) -> None:
     """Every command that the page or the help shows runs and writes the file that it names."""
     mapp_env.solve(mapp_env.Problem(mapp_env.make_grid(), (0, 48))).save("plan.json")
     (folder / "docs" / "images").mkdir(parents=True)
-    lines = command_lines(PAGE) + command_lines(COMMANDS[0].__doc__ or "")
+    lines = command_lines(PAGE) + command_lines(render.__doc__ or "")
     assert len(lines) >= 8
     for line in lines:
         words = line.split()

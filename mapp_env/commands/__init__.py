@@ -1,4 +1,4 @@
-"""The commands of ``python -m mapp_env``, one file each.
+"""The commands of ``python -m mapp_env``, also installed as ``mapp``, one file each.
 
 A command's file has ``add_arguments(parser)``, ``run(arguments)`` and a docstring, which
 ``--help`` shows. What cannot be done is a ``ValueError`` or an ``ImportError`` anywhere below:
@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
-from mapp_env.commands import render
+from mapp_env.commands import info, render, solve, universe
 
 __all__ = ["COMMANDS", "main"]
 
-COMMANDS: tuple[ModuleType, ...] = (render,)
+COMMANDS: tuple[ModuleType, ...] = (solve, render, universe, info)
+PROGRAM = "mapp"  # of the console script
 REFUSED = 2  # exit status of what cannot be done, as of argparse
 INTERRUPTED = 130
 
@@ -45,7 +46,7 @@ def main(command_line: Sequence[str] | None = None) -> int:
         0, or 2 with a line on the standard error stream that says what is wrong.
     """
     parser = _Parser(
-        prog="python -m mapp_env",
+        prog=PROGRAM if os.path.basename(sys.argv[0]) == PROGRAM else "python -m mapp_env",
         description="Multi-agent path planning on walled grids, from the command line.",
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

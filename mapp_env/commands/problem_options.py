@@ -12,14 +12,20 @@ from mapp_env.problem import Problem, sample_problems
 from mapp_env.task import find_grid
 from mapp_env.validation import describe
 
-__all__ = ["add_problem_options", "problem_of", "refuse_problem_options"]
+__all__ = [
+    "add_grid_options",
+    "add_problem_options",
+    "grid_of",
+    "problem_of",
+    "refuse_problem_options",
+]
 
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
+OPTIONS = ("problem", "grid", "rows", "cols", "grid_seed", "landmarks", "n_landmarks", "n_agents")
 
 
-def add_problem_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options to a command's parser; those not given are ``None``."""
-    group = parser.add_argument_group("the problem")
+def add_grid_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options that say which grid; those not given are ``None``."""
     group.add_argument(
         "--grid",
         metavar="GRID",
@@ -31,6 +37,17 @@ def add_problem_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--grid-seed", type=int, metavar="S", help="which of the generated grids (default 0)"
     )
+
+
+def add_problem_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options to a command's parser; those not given are ``None``."""
+    group = parser.add_argument_group("the problem")
+    group.add_argument(
+        "--problem",
+        metavar="FILE",
+        help="a problem file, as Problem.save writes it, in place of the options below",
+    )
+    add_grid_options(group)
     group.add_argument(
         "--landmarks",
         nargs="+",
@@ -55,7 +72,10 @@ def problem_of(arguments: argparse.Namespace) -> Problem:
     ValueError
         If there is none.
     """
-    grid = _grid_of(arguments)
+    if arguments.problem is not None:
+        refuse_problem_options(arguments, "a problem file", but="problem")
+        return Problem.load(arguments.problem)
+    grid = grid_of(arguments)
     n_agents = N_AGENTS if arguments.n_agents is None else arguments.n_agents
     landmarks = arguments.landmarks
     if landmarks is None:
@@ -67,20 +87,27 @@ def problem_of(arguments: argparse.Namespace) -> Problem:
     return Problem(grid, landmarks, n_agents)
 
 
-def refuse_problem_options(arguments: argparse.Namespace, reason: str) -> None:
-    """Refuse options that another source of the problem would leave without effect.
+def refuse_problem_options(arguments: argparse.Namespace, reason: str, but: str = "") -> None:
+    """Refuse options that another source of the problem, named in `but`, leaves without effect.
 
     Raises
     ------
     ValueError
         If one of them was given.
     """
-    for name in ("grid", "rows", "cols", "grid_seed", "landmarks", "n_landmarks", "n_agents"):
-        if getattr(arguments, name) is not None:
+    for name in OPTIONS:
+        if name != but and getattr(arguments, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} does not go with {reason}")
 
 
-def _grid_of(arguments: argparse.Namespace) -> Grid:
+def grid_of(arguments: argparse.Namespace) -> Grid:
+    """Return the grid that the options describe.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
     name = GRID if arguments.grid is None else arguments.grid
     options = {
         option: value

@@ -11,33 +11,33 @@ For example:
     python -m mapp_env render --out random.gif --plan random
   a plan that plan.save() wrote
     python -m mapp_env render --out plan.png --plan plan.json
+  a trained policy, by its name or run folder
+    python -m mapp_env render --out policy.gif --policy pretrained --landmarks 0 6 20 42 48
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 from gymnasium.utils import seeding
 
+from mapp_env.commands.pictures import DEFAULT_FPS, PICTURES, picture_writer
+from mapp_env.commands.policies import DEFAULT_LOADER, load_policy, play_policy
 from mapp_env.commands.problem_options import (
     add_problem_options,
     problem_of,
     refuse_problem_options,
 )
-from mapp_env.files import check_writable
+from mapp_env.commands.reports import add_json_option, costs_line, costs_record, print_report
 from mapp_env.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers import solve
-from mapp_env.validation import MAX_SEED, check_count, describe
+from mapp_env.validation import MAX_SEED, check_count
 
 __all__ = ["add_arguments", "run"]
 
-ANIMATIONS, FIGURES = (".gif",), (".png", ".svg", ".pdf")
-FPS, STEPS = 4.0, 50
+STEPS = 50
 MAX_STEPS = 1_999  # an animation may have one frame more
 
 
@@ -47,14 +47,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         required=True,
         metavar="FILE",
-        help="where to write: .gif an animation; .png, .svg or .pdf a figure (needs matplotlib)",
+        help=f"where to draw: {', '.join(PICTURES)}; all but an animation need matplotlib",
     )
     parser.add_argument(
         "--plan",
-        default="optimum",
         metavar="PLAN",
         help="what is played: optimum (proven up to 20 landmarks, else the best found), random, "
         "or a plan file, which brings its problem along (default optimum)",
+    )
+    parser.add_argument(
+        "--policy", metavar="NAME", help="in place of a plan: a trained policy that plays"
+    )
+    parser.add_argument(
+        "--policy-loader",
+        default=DEFAULT_LOADER,
+        metavar="MODULE:FUNCTION",
+        help="what turns the name into something with act(observations (B, N + 2K)) -> actions "
+        f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
     )
     parser.add_argument(
         "--objective",
@@ -62,11 +71,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what the optimum minimises (default cover_time)",
     )
     parser.add_argument(
-        "--max-cycles", type=int, metavar="T", help=f"steps of random at most (default {STEPS})"
+        "--max-cycles",
+        type=int,
+        metavar="T",
+        help=f"steps of random or of a policy at most (default {STEPS})",
     )
     parser.add_argument(
-        "--fps", type=float, metavar="F", help=f"frames a second of a GIF (default {FPS:g})"
+        "--fps", type=float, metavar="F", help=f"frames a second of a GIF (default {DEFAULT_FPS:g})"
     )
+    add_json_option(parser)
     add_problem_options(parser)
 
 
@@ -78,73 +91,48 @@ def run(arguments: argparse.Namespace) -> None:
     ValueError
         If an option cannot be used, or the file cannot be written.
     ImportError
-        If a figure is asked for and matplotlib is not there.
+        If a library that was asked for is not there.
     """
-    out = arguments.out
-    suffix = os.path.splitext(out)[1].lower()
-    if suffix not in (*ANIMATIONS, *FIGURES):
-        raise ValueError(
-            f"--out must end in {', '.join((*ANIMATIONS, *FIGURES))}, got {describe(out)}"
-        )
-    if suffix in FIGURES and arguments.fps is not None:
-        raise ValueError("--fps is for animations: it does not go with a figure")
-    check_writable(out)
-    # What is missing, too, is said before a search, not after it.
-    draw = _animate if suffix in ANIMATIONS else _figure_writer()
+    draw = picture_writer("--out", arguments.out, arguments.fps)
     problem, plan = _plan_of(arguments)
-    size = draw(out, problem, plan, FPS if arguments.fps is None else arguments.fps)
-    print(f"wrote {out}: {size} bytes")
-    print(_costs(problem, plan))
+    size = draw(problem, plan)
+    print_report(
+        arguments,
+        {"out": arguments.out, "bytes": size, **costs_record(plan)},
+        [f"wrote {arguments.out}: {size} bytes", costs_line(problem, plan)],
+    )
 
 
 def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
     """Return what is played, and on what."""
-    source = arguments.plan
+    if arguments.policy is not None and arguments.plan is not None:
+        raise ValueError("--policy is in place of a plan: it does not go with --plan")
+    source = "policy" if arguments.policy is not None else arguments.plan or "optimum"
     if arguments.objective is not None and source != "optimum":
         raise ValueError("--objective is for --plan optimum")
-    if arguments.max_cycles is not None and source != "random":
-        raise ValueError("--max-cycles is for --plan random")
-    if source not in ("optimum", "random"):
-        refuse_problem_options(arguments, "a plan file, which brings its problem along")
-        if arguments.seed is not None:
-            raise ValueError("--seed does not go with a plan file")
-        plan = Plan.load(source)
-        if plan.problem is None:
-            raise ValueError(f"{source}: has no problem")
-        return plan.problem, plan
+    if arguments.max_cycles is not None and source not in ("random", "policy"):
+        raise ValueError("--max-cycles is for --plan random and --policy")
+    if source not in ("optimum", "random", "policy"):
+        return _read_plan(arguments, source)
     problem = problem_of(arguments)
     seed = check_count("--seed", 0 if arguments.seed is None else arguments.seed, 0, MAX_SEED)
     if source == "optimum":
         return problem, solve(problem, arguments.objective or "cover_time", seed=seed)
     limit = STEPS if arguments.max_cycles is None else arguments.max_cycles
-    problem = replace(problem, max_cycles=check_count("--max-cycles", limit, 1, MAX_STEPS))
+    limit = check_count("--max-cycles", limit, 1, MAX_STEPS)
+    if source == "policy":
+        act = load_policy(arguments.policy, arguments.policy_loader)
+        return problem, play_policy(act, problem, limit)
+    problem = replace(problem, max_cycles=limit)
     generator, _ = seeding.np_random(seed)
     return problem, replay(problem, generator.integers(0, 4, (limit, problem.n_agents)))
 
 
-def _animate(out: str, problem: Problem, plan: Plan, fps: float) -> int:
-    from mapp_env.rendering import save_animation
-
-    return save_animation(out, problem, plan.actions, fps)
-
-
-def _figure_writer() -> Callable[[str, Problem, Plan, float], int]:
-    from mapp_env.rendering import draw_plan, save_figure
-
-    def write(out: str, problem: Problem, plan: Plan, _fps: float) -> int:
-        figure: Any = draw_plan(problem, plan).figure  # as no axes were given, not a part of one
-        return save_figure(figure, out)
-
-    return write
-
-
-def _costs(problem: Problem, plan: Plan) -> str:
-    if not plan.success:
-        visited = sum(map(len, plan.claims))
-        return f"not solved: {visited} of {len(problem.landmarks)} landmarks visited"
-    costs = ", ".join(f"{name.replace('_', ' ')} {getattr(plan, name)}" for name in OBJECTIVES)
-    if plan.status == "optimal":
-        return f"{costs}; the {plan.objective.replace('_', ' ')} is proven optimal"
-    if plan.bound is not None:
-        return f"{costs}; the {plan.objective.replace('_', ' ')} is at least {plan.bound}"
-    return costs
+def _read_plan(arguments: argparse.Namespace, file: str) -> tuple[Problem, Plan]:
+    refuse_problem_options(arguments, "a plan file, which brings its problem along")
+    if arguments.seed is not None:
+        raise ValueError("--seed does not go with a plan file")
+    plan = Plan.load(file)
+    if plan.problem is None:
+        raise ValueError(f"{file}: has no problem")
+    return plan.problem, plan

@@ -1,0 +1,100 @@
+"""Say what runs here: versions, the cache of compiled code, the machine.
+
+For example:
+  for people, and for a bug report
+    python -m mapp_env info
+  for a program
+    python -m mapp_env info --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+from importlib import metadata
+from typing import Any
+
+from mapp_env.commands.reports import add_json_option, print_report, words
+from mapp_env.compiled import cache_files, cache_folders
+
+__all__ = ["add_arguments", "run"]
+
+PACKAGES = ("mapp-env", "numpy", "numba", "gymnasium", "pettingzoo", "pillow")
+EXTRAS = ("matplotlib", "pygame-ce", "pyvrp", "torch", "supersuit", "stable-baselines3")
+
+# In a process of its own: importing torch takes seconds, and a broken one must not take this along.
+ACCELERATOR = """
+import torch
+accelerated = torch.cuda.is_available()
+print(torch.cuda.get_device_name(0) if accelerated else f"none, torch {torch.__version__}")
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    add_json_option(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Print what runs here."""
+    record: dict[str, Any] = {
+        "versions": {"python": platform.python_version(), **_versions(PACKAGES)},
+        "extras": _versions(EXTRAS),
+        "compiled_code": _compiled_code(),
+        "device": {
+            "platform": platform.platform(),
+            "processor": platform.machine(),
+            "cores": os.cpu_count(),
+            "accelerator_for_learners": _accelerator(),
+        },
+    }
+    lines = []
+    for part, entries in record.items():
+        lines.append(words(part))
+        lines += [f"  {words(name):<25} {_shown(value)}" for name, value in entries.items()]
+    print_report(arguments, record, lines)
+
+
+def _versions(packages: tuple[str, ...]) -> dict[str, str | None]:
+    """Return which versions are installed; none of them is imported."""
+    found: dict[str, str | None] = {}
+    for name in packages:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def _compiled_code() -> dict[str, Any]:
+    """Return where compiled kernels are kept, and how much there is of them."""
+    files, folders = cache_files(), cache_folders()
+    return {
+        "compiled": bool(folders),
+        "cache": [str(folder) for folder in folders],
+        "files": len(files),
+        "bytes": sum(path.stat().st_size for path in files),
+    }
+
+
+def _accelerator() -> str | None:
+    """Return what torch would compute on beside the processor; None without torch."""
+    if _versions(("torch",))["torch"] is None:
+        return None
+    done = subprocess.run(
+        [sys.executable, "-c", ACCELERATOR], capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() if done.returncode == 0 else "torch cannot be imported"
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "not installed"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(value) or "none"
+    return f"{value:,}" if isinstance(value, int) else str(value)

@@ -1,0 +1,71 @@
+"""What commands draw into a file: the name's ending says what."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+from mapp_env.files import check_writable
+from mapp_env.plan import Plan
+from mapp_env.problem import Problem
+from mapp_env.validation import describe
+
+__all__ = ["DEFAULT_FPS", "PICTURES", "picture_writer"]
+
+ANIMATIONS, FIGURES = (".gif",), (".png", ".svg", ".pdf")
+PICTURES = (*ANIMATIONS, *FIGURES)
+DEFAULT_FPS = 4.0
+
+
+def picture_writer(
+    option: str, out: str, fps: float | None = None
+) -> Callable[[Problem, Plan], int]:
+    """Return what draws a plan into a file, and says how many bytes that took.
+
+    What stands in the way is said here, before anybody searches for a plan.
+
+    Parameters
+    ----------
+    option : str
+        What messages call the file.
+    out : str
+        The file: .gif for an animation; .png, .svg or .pdf for a figure.
+    fps : float, optional
+        Frames a second of an animation.
+
+    Raises
+    ------
+    ValueError
+        If nothing can be drawn there.
+    ImportError
+        If it is a figure and matplotlib is not there.
+    """
+    suffix = os.path.splitext(out)[1].lower()
+    if suffix not in PICTURES:
+        raise ValueError(f"{option} must end in {', '.join(PICTURES)}, got {describe(out)}")
+    if suffix in FIGURES and fps is not None:
+        raise ValueError("--fps is for animations: it does not go with a figure")
+    check_writable(out)
+    if suffix in ANIMATIONS:
+        return _animation(out, DEFAULT_FPS if fps is None else fps)
+    return _figure(out)
+
+
+def _animation(out: str, fps: float) -> Callable[[Problem, Plan], int]:
+    def write(problem: Problem, plan: Plan) -> int:
+        from mapp_env.rendering import save_animation
+
+        return save_animation(out, problem, plan.actions, fps)
+
+    return write
+
+
+def _figure(out: str) -> Callable[[Problem, Plan], int]:
+    from mapp_env.rendering import draw_plan, save_figure
+
+    def write(problem: Problem, plan: Plan) -> int:
+        figure: Any = draw_plan(problem, plan).figure  # as no axes were given, not a part of one
+        return save_figure(figure, out)
+
+    return write

@@ -1,0 +1,58 @@
+"""What commands print: lines for people, or one JSON object for programs."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from mapp_env.plan import OBJECTIVES, Plan
+from mapp_env.problem import Problem
+
+__all__ = ["add_json_option", "costs_line", "costs_record", "print_report", "words"]
+
+
+def add_json_option(parser: argparse.ArgumentParser) -> None:
+    """Add ``--json`` to a command's parser."""
+    parser.add_argument(
+        "--json", action="store_true", help="print one JSON object in place of text"
+    )
+
+
+def print_report(
+    arguments: argparse.Namespace, record: dict[str, Any], lines: Sequence[str]
+) -> None:
+    """Print what a command found out, as the user asked for it."""
+    print(json.dumps(record, allow_nan=False) if arguments.json else "\n".join(lines))
+
+
+def words(name: str) -> str:
+    """Return a name as people write it."""
+    return name.replace("_", " ")
+
+
+def costs_line(problem: Problem, plan: Plan) -> str:
+    """Return a plan's costs, and what is proven about them."""
+    if not plan.success:
+        visited = sum(map(len, plan.claims))
+        return f"not solved: {visited} of {len(problem.landmarks)} landmarks visited"
+    costs = ", ".join(f"{words(name)} {getattr(plan, name)}" for name in OBJECTIVES)
+    if plan.status == "optimal":
+        return f"{costs}; the {words(plan.objective)} is proven optimal"
+    if plan.bound is not None:
+        return f"{costs}; the {words(plan.objective)} is at least {plan.bound}"
+    return costs
+
+
+def costs_record(plan: Plan) -> dict[str, Any]:
+    """Return the same for programs; a cost that is infinite is null."""
+    costs = {name: getattr(plan, name) for name in OBJECTIVES}
+    return {
+        "success": plan.success,
+        **{name: None if cost == math.inf else int(cost) for name, cost in costs.items()},
+        "objective": plan.objective,
+        "status": plan.status,
+        "bound": plan.bound,
+    }

@@ -1,0 +1,94 @@
+"""Solve a problem: routes, their costs, and what is proven about them.
+
+For example:
+  the proven optimum of a problem of the default grid
+    python -m mapp_env solve --landmarks 0 6 20 42 48
+  everybody home as soon as possible, as a figure and as a file that Plan.load reads
+    python -m mapp_env solve --objective makespan --picture routes.png --out plan.json
+  a map of one's own, landmarks by row and column
+    python -m mapp_env solve --grid office.map --landmarks 3,4 10,2 --n-agents 2
+  sixty landmarks of a warehouse, with a second to search
+    python -m mapp_env solve --grid warehouse --n-landmarks 60 --time-limit 1
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from mapp_env.commands.pictures import PICTURES, picture_writer
+from mapp_env.commands.problem_options import add_problem_options, problem_of
+from mapp_env.commands.reports import add_json_option, costs_line, print_report
+from mapp_env.files import check_writable
+from mapp_env.plan import OBJECTIVES, Plan
+from mapp_env.solvers import METHODS, solve
+
+__all__ = ["add_arguments", "run"]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    parser.add_argument(
+        "--objective",
+        choices=OBJECTIVES,
+        default=OBJECTIVES[0],
+        help=f"what is minimised (default {OBJECTIVES[0]})",
+    )
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="exact proves the optimum of up to 20 landmarks, search takes any number, pyvrp needs "
+        f"the package of that name (default {METHODS[0]}: exact, else search)",
+    )
+    parser.add_argument(
+        "--time-limit", type=float, metavar="SECONDS", help="that a search may take"
+    )
+    parser.add_argument("--out", metavar="FILE", help="where to write the plan: a JSON file")
+    parser.add_argument(
+        "--picture", metavar="FILE", help=f"where to draw it: {', '.join(PICTURES)}"
+    )
+    add_json_option(parser)
+    add_problem_options(parser)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Solve, and print, write and draw what was asked for.
+
+    Raises
+    ------
+    ValueError
+        If an option cannot be used, or a file cannot be written.
+    ImportError
+        If a library that was asked for is not there.
+    """
+    if arguments.out is not None:
+        check_writable(arguments.out)
+    draw = None
+    if arguments.picture is not None:
+        draw = picture_writer("--picture", arguments.picture)
+    problem = problem_of(arguments)
+    plan = solve(
+        problem,
+        arguments.objective,
+        arguments.method,
+        arguments.time_limit,
+        0 if arguments.seed is None else arguments.seed,
+    )
+    if arguments.out is not None:
+        plan.save(arguments.out)
+    if draw is not None:
+        draw(problem, plan)
+    lines = [costs_line(problem, plan), *_tour_lines(plan), _made_line(plan)]
+    lines += [f"wrote {name}" for name in (arguments.out, arguments.picture) if name is not None]
+    print_report(arguments, plan.to_record(), lines)
+
+
+def _tour_lines(plan: Plan) -> list[str]:
+    return [
+        f"agent {agent}: {' '.join(map(str, tour)) or 'stays at the depot'}"
+        for agent, tour in enumerate(plan.tours)
+    ]
+
+
+def _made_line(plan: Plan) -> str:
+    return f"by {plan.solver} in {1000 * plan.seconds:.1f} ms"

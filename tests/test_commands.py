@@ -1,0 +1,317 @@
+"""The commands solve, universe and info; policies and problem files in all of them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import subprocess
+import sys
+import types
+from collections import Counter
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import mapp_env
+from mapp_env.commands import info, main, solve, universe
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+LANDMARKS = (0, 6, 20, 42, 48)
+CELLS = [str(cell) for cell in LANDMARKS]
+PROBLEM = mapp_env.Problem(mapp_env.make_grid(), LANDMARKS)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty folder that the test runs in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """Return what a command prints."""
+    assert main(list(words)) == 0
+    return capsys.readouterr().out
+
+
+def record(capsys: pytest.CaptureFixture[str], *words: str) -> Any:
+    """Return the one JSON object that a command prints."""
+    return json.loads(printed(capsys, *words, "--json"))
+
+
+# -- solve -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("objective", ["cover_time", "makespan", "total_distance"])
+def test_solve_prints_the_optimum(capsys: pytest.CaptureFixture[str], objective: str) -> None:
+    """Costs, proof and every agent's tour are those of the function solve."""
+    lines = printed(capsys, "solve", "--landmarks", *CELLS, "--objective", objective).splitlines()
+    plan = mapp_env.solve(PROBLEM, objective)
+    words = objective.replace("_", " ")
+    assert lines[0] == (
+        f"cover time {plan.cover_time}, makespan {plan.makespan}, total distance "
+        f"{plan.total_distance}; the {words} is proven optimal"
+    )
+    tours = [" ".join(map(str, tour)) or "stays at the depot" for tour in plan.tours]
+    assert lines[1:4] == [f"agent {agent}: {tour}" for agent, tour in enumerate(tours)]
+    assert re.fullmatch(r"by exact in \d+\.\d ms", lines[4])
+
+
+def test_solve_writes_what_it_prints(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The plan file is the JSON object printed, and loads as the plan; the picture is there."""
+    options = ["--landmarks", *CELLS, "--out", "plan.json", "--picture", "a.gif"]
+    found = record(capsys, "solve", *options)
+    written = json.loads((folder / "plan.json").read_text())
+    assert {name: written[name] for name in found} == found
+    plan = mapp_env.Plan.load("plan.json")
+    assert plan == mapp_env.solve(PROBLEM)
+    with Image.open("a.gif") as image:
+        assert image.n_frames == plan.cover_time + 1
+
+
+def test_a_problem_file_is_a_problem(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A saved problem, with agents and a grid of its own, is solved and drawn as it is."""
+    grid = mapp_env.make_grid("rooms", rows=9, cols=11, seed=1)
+    problem = mapp_env.Problem(grid, grid.reachable[[2, 30]].tolist(), 1)
+    problem.save("problem.json")
+    cost = mapp_env.solve(problem).cost
+    assert record(capsys, "solve", "--problem", "problem.json")["cover_time"] == cost
+    drawn = record(capsys, "render", "--problem", "problem.json", "--out", "a.gif")
+    assert (drawn["cover_time"], drawn["status"]) == (cost, "optimal")
+    assert drawn["bytes"] == (folder / "a.gif").stat().st_size
+
+
+def test_a_search_says_what_is_not_proven(capsys: pytest.CaptureFixture[str]) -> None:
+    """Beyond exact sizes, and where it is asked for, the solver and the bound are named."""
+    options = ["--grid", "warehouse", "--n-landmarks", "40", "--time-limit", "0.2"]
+    found = record(capsys, "solve", *options)
+    assert found["solver"] == "search"
+    assert found["bound"] <= found["cover_time"]
+    assert (
+        record(capsys, "solve", "--landmarks", *CELLS, "--method", "search")["solver"] == "search"
+    )
+
+
+# -- universe ----------------------------------------------------------------------------------
+
+
+def test_universe_counts_every_problem(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The histogram of a small grid is that of solving each of its problems by itself."""
+    (folder / "map.txt").write_text("...\nD#.\n...\n", encoding="ascii")
+    grid = mapp_env.Grid.load("map.txt")
+    options = ["--grid", "map.txt", "--n-landmarks", "3", "--n-agents", "2"]
+    found = record(capsys, "universe", *options)
+    sets = list(itertools.combinations(grid.reachable.tolist(), 3))
+    assert found["n_problems"] == len(sets)
+    for objective in ("cover_time", "makespan", "total_distance"):
+        costs = [
+            int(mapp_env.solve(mapp_env.Problem(grid, cells, 2), objective).cost) for cells in sets
+        ]
+        about = found["objectives"][objective]
+        assert about["histogram"] == {str(cost): n for cost, n in sorted(Counter(costs).items())}
+        assert (about["min"], about["max"]) == (min(costs), max(costs))
+        assert about["mean"] == pytest.approx(np.mean(costs))
+        assert costs[sets.index(tuple(about["hardest"]))] == max(costs)
+
+
+def test_universe_draws_its_histogram(capsys: pytest.CaptureFixture[str]) -> None:
+    """For people: shares that add up to all, and a bar as long as the count of the commonest."""
+    text = printed(capsys, "universe", "--n-landmarks", "2", "--objective", "cover_time")
+    assert text.startswith("780 problems of 2 landmarks and 3 agents on 7x7 cells")
+    rows = re.findall(r"^ +(\d+) +([\d,]+) +([\d.]+) %(?: (#+))?$", text, re.MULTILINE)
+    counts = [int(count.replace(",", "")) for _, count, _, _ in rows]
+    assert sum(counts) == 780
+    for count, (_, _, share, bar) in zip(counts, rows, strict=True):
+        assert float(share) == pytest.approx(100 * count / 780, abs=0.006)
+        assert len(bar) == round(40 * count / max(counts))
+
+
+# -- info --------------------------------------------------------------------------------------
+
+
+def test_info_tells_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:
+    """Versions are the installed ones, the cache is where compiled code is, and torch has a say."""
+    mapp_env.solve(PROBLEM)
+    found = record(capsys, "info")
+    assert found["versions"]["mapp-env"] == mapp_env.__version__
+    for name in ("numpy", "numba", "gymnasium", "pettingzoo"):
+        assert found["versions"][name] == metadata.version(name)
+    code = found["compiled_code"]
+    files = [path for place in code["cache"] for path in Path(place).glob("*.nb[ci]")]
+    assert 0 < code["files"] <= len(files)
+    assert 0 < code["bytes"] <= sum(path.stat().st_size for path in files)
+    assert metadata.version("torch") in found["device"]["accelerator_for_learners"]
+    text = printed(capsys, "info")
+    assert all(str(value) in text for value in found["versions"].values())
+
+
+def test_info_without_torch_or_compiler(tmp_path: Path) -> None:
+    """Where torch is not installed it says so; where nothing is compiled there is no cache."""
+    code = (
+        "import sys; from importlib import metadata; real = metadata.version\n"
+        "def version(name):\n"
+        "    if name == 'torch': raise metadata.PackageNotFoundError(name)\n"
+        "    return real(name)\n"
+        "metadata.version = version\n"
+        "from mapp_env.commands import main; sys.exit(main(['info', '--json']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(REPOSITORY)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = json.loads(done.stdout)
+    assert found["extras"]["torch"] is None
+    assert found["device"]["accelerator_for_learners"] is None
+    assert found["compiled_code"] == {"compiled": False, "cache": [], "files": 0, "bytes": 0}
+
+
+# -- policies ----------------------------------------------------------------------------------
+
+
+class Walker:
+    """A policy that walks right for ever; its name is how many agents it is for."""
+
+    def __init__(self, name: str) -> None:
+        self.n_agents = int(name)
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """Return (B, N) actions."""
+        return np.full((len(observations), self.n_agents), 1)
+
+
+@pytest.fixture
+def loader(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Return the name of a loader of policies."""
+    module = types.ModuleType("walkers")
+    module.load = Walker  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "walkers", module)
+    return "walkers:load"
+
+
+def test_a_policy_plays(folder: Path, capsys: pytest.CaptureFixture[str], loader: str) -> None:
+    """Any policy's episode is what the rules make of its actions, to the limit if it fails."""
+    options = ["--policy", "3", "--policy-loader", loader, "--max-cycles", "7", "--out", "a.gif"]
+    assert "not solved: 1 of 2" in printed(capsys, "render", *options, "--landmarks", "26", "0")
+    with Image.open(folder / "a.gif") as image:
+        assert image.n_frames == 8
+    found = record(capsys, "render", *options, "--landmarks", "26")
+    assert (found["success"], found["cover_time"]) == (True, 2)
+
+
+def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By default policies come from the baselines: the pretrained one never beats the optimum."""
+    options = ["--policy", "pretrained", "--out", "a.gif", "--landmarks", *CELLS]
+    found = record(capsys, "render", *options)
+    assert found["success"]
+    assert found["cover_time"] >= mapp_env.solve(PROBLEM).cost
+
+
+# -- refusals ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("solve --method exact --n-landmarks 30", "20 landmarks"),
+        ("solve --method guess", "--method"),
+        ("solve --objective speed", "--objective"),
+        ("solve --time-limit 0", "time_limit must be a positive number"),
+        ("solve --time-limit nan", "time_limit must be a positive number"),
+        ("solve --out no/plan.json", "cannot be written"),
+        ("solve --picture a.bmp", r"--picture must end in \.gif.*got 'a.bmp'"),
+        ("solve --picture no/a.gif", "cannot be written"),
+        ("solve --problem nope.json", "cannot be opened as a problem file"),
+        ("solve --problem bad.json", "bad.json: is not strict JSON"),
+        ("solve --problem bad.json --grid rooms", "--grid does not go with a problem file"),
+        ("solve --problem bad.json --landmarks 1", "--landmarks does not go with a problem file"),
+        (
+            "render --out a.gif --plan bad.json --problem bad.json",
+            "--problem does not go",
+        ),
+        ("render --out a.gif --plan random --policy 3", "does not go with --plan"),
+        ("render --out a.gif --policy 3 --objective makespan", "is for --plan optimum"),
+        ("render --out a.gif --policy 3 --policy-loader walkers", "must be MODULE:FUNCTION"),
+        ("render --out a.gif --policy 3 --policy-loader nowhere:load", "No module named 'nowhere'"),
+        ("render --out a.gif --policy 3 --policy-loader walkers:fly", "no attribute 'fly'"),
+        ("render --out a.gif --policy 2 --policy-loader walkers:load", "action"),
+        ("render --out a.gif --policy nope", "pretrained, pretrained-distilled"),
+        ("render --out a.gif --policy pretrained --n-landmarks 3", "observations must"),
+        ("universe --n-landmarks 9", "273,438,880 problems"),
+        ("universe --n-landmarks 0", "n_landmarks must be"),
+        ("universe --n-agents 17", "n_agents must be"),
+        ("universe --landmarks 3", "--landmarks"),
+        ("info --surprise", "--surprise"),
+    ],
+)
+@pytest.mark.usefixtures("loader")
+def test_refusals_are_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], line: str, words: str
+) -> None:
+    """Whatever is wrong gives exit status 2, one line that says what, and no file."""
+    (folder / "bad.json").write_text("{", encoding="ascii")
+    try:
+        status = main(line.split())
+    except SystemExit as leaving:  # argparse's own way
+        status = int(leaving.code or 0)
+    streams = capsys.readouterr()
+    assert (status, streams.out) == (2, "")
+    assert re.fullmatch(rf"error: [^\n]*({words})[^\n]*\n", streams.err), streams.err
+    assert [path.name for path in folder.iterdir()] == ["bad.json"]
+
+
+def test_without_the_baselines_policies_say_what_to_install(tmp_path: Path) -> None:
+    """The installed package alone has no policies: the line names what brings them."""
+    code = (
+        "import sys; sys.modules['baselines'] = None; from mapp_env.commands import main;"
+        "sys.exit(main(['render', '--out', 'a.gif', '--policy', 'pretrained']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert re.fullmatch(r"error: policies are loaded by .*editable mode.*\n", done.stderr)
+
+
+# -- what documents say ------------------------------------------------------------------------
+
+PAGE = (REPOSITORY / "docs" / "command_line.md").read_text(encoding="utf-8")
+
+
+def test_the_console_script_is_the_module(tmp_path: Path) -> None:
+    """The installed `mapp` does what `python -m mapp_env` does, under its own name."""
+    script = Path(sys.executable).parent / "mapp"
+    told = subprocess.run([script, "--help"], capture_output=True, text=True, check=True).stdout
+    assert told.startswith("usage: mapp ")
+    module = [sys.executable, "-m", "mapp_env", "--help"]
+    told = subprocess.run(module, capture_output=True, text=True, check=True).stdout
+    assert told.startswith("usage: python -m mapp_env ")
+
+
+def test_commands_of_the_page_and_the_helps_work(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every command that the page or a help shows runs, and prints what the page says."""
+    (folder / "office.map").write_text(
+        "type octile\nheight 5\nwidth 12\nmap\n" + 5 * f"{12 * '.'}\n", encoding="ascii"
+    )
+    lines = re.findall(r"^mapp (.*)$", PAGE, re.MULTILINE)
+    for module in (solve, universe, info):
+        lines += re.findall(r"^ *python -m mapp_env (.*)$", module.__doc__ or "", re.MULTILINE)
+    assert len(lines) >= 16
+    outputs = {}
+    for line in dict.fromkeys(lines):
+        if "--policy" not in line:  # played above
+            assert main(line.replace("10,2", "4,2").split()) == 0, line
+            outputs[line] = capsys.readouterr().out
+    for line, promise in re.findall(r"^mapp ([^\n]*)\n```\n\n```text\n(.*?)```", PAGE, re.M | re.S):
+        seconds = r"\d+\.\d+ m?s"
+        assert re.sub(seconds, "", outputs[line]) == re.sub(seconds, "", promise)
