@@ -5,8 +5,9 @@ Command::
     python baselines/solve.py --policy pretrained --landmarks 0 6 20 42 48 --picture routes.png
 
 Output: the routes, their costs and the gap to the optimum; with ``--picture`` a figure of the
-policy's routes and the optimal ones, with ``--plan`` the policy's plan as a JSON file that
-``mapp_env.Plan.load`` reads. Exit code 1 if the policy does not solve the problem.
+policy's routes and the optimal ones, with ``--animation`` both played side by side, with ``--plan``
+the policy's plan as a JSON file that ``mapp_env.Plan.load`` reads. Exit code 1 if the policy does
+not solve the problem.
 """
 
 import sys
@@ -36,6 +37,8 @@ class Args:
     """where to draw the routes beside the optimum: a .png, .svg or .pdf file"""
     plan: Path | None = None
     """where to write the policy's plan: a JSON file"""
+    animation: Path | None = None
+    """where to play the policy beside the optimum: an animated .gif file"""
 
 
 def load(policy: str) -> tuple[NetworkPolicy, Setting]:
@@ -92,10 +95,14 @@ def report(problem: Problem, plans: dict[str, Plan], optimum: Plan) -> None:
         if plan.success and optimum.status == "optimal":
             line += f"; gap {100 * (plan.cover_time / optimum.cost - 1):.1f} %"
         print(line)
-    name = "optimum" if optimum.status == "optimal" else "best known"
-    print(describe(name, optimum))
+    print(describe(proof(optimum), optimum))
     for agent, tour in enumerate(list(plans.values())[-1].tours):
         print(f"agent {agent}: {' '.join(map(str, tour)) or 'stays at the depot'}")
+
+
+def proof(plan: Plan) -> str:
+    """Return what the solver's plan is called."""
+    return "optimum" if plan.status == "optimal" else "best known"
 
 
 def save(args: Args, problem: Problem, plans: dict[str, Plan], optimum: Plan) -> None:
@@ -107,9 +114,13 @@ def save(args: Args, problem: Problem, plans: dict[str, Plan], optimum: Plan) ->
         # Only here: drawing takes longer to import than all the rest to run.
         from mapp_env.rendering import compare_plans
 
-        name = "optimum" if optimum.status == "optimal" else "best known"
-        compare_plans(problem, {**plans, name: optimum}, args.picture)
+        compare_plans(problem, {**plans, proof(optimum): optimum}, args.picture)
         print(f"picture: {args.picture}")
+    if args.animation is not None:
+        from mapp_env.rendering import animate_plans
+
+        size = animate_plans(args.animation, problem, {**plans, proof(optimum): optimum})
+        print(f"animation: {args.animation}, {size:,} bytes")
 
 
 def main(args: Args) -> int:

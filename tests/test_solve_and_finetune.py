@@ -164,9 +164,9 @@ def test_imagined_episodes_are_made_of_experienced_moves():
 
 
 def test_solving_from_the_command_line(folder, capsys):
-    """Costs beside the optimum, a picture and a plan; exit code 1 where it is not solved."""
-    plan, picture = folder / "plan.json", folder / "routes.png"
-    args = solve.Args(CELLS, str(folder), picture, plan)
+    """Costs beside the optimum, pictures and a plan; exit code 1 where it is not solved."""
+    plan, picture, animation = folder / "plan.json", folder / "routes.png", folder / "both.gif"
+    args = solve.Args(CELLS, str(folder), picture, plan, animation)
     status = solve.main(args)
     printed = capsys.readouterr().out
     loaded = Plan.load(plan)
@@ -174,6 +174,7 @@ def test_solving_from_the_command_line(folder, capsys):
     assert f"optimum: cover time {optimal_costs(GRID, [CELLS], 2)[0]}" in printed
     assert ("policy: not solved" in printed) == (not loaded.success)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert animation.read_bytes().startswith(b"GIF")
 
 
 def test_what_cannot_be_solved_is_refused(folder):

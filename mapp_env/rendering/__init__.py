@@ -2,8 +2,9 @@
 
 ``Scene`` is what a picture shows. ``ansi(scene)`` draws it as text, ``rgb_array(scene)`` as pixels
 (Pillow), ``Window`` shows pixels on the screen (pygame-ce). ``save_animation(path, problem,
-joint_actions)`` plays an episode into an animated GIF, and ``save_gif(path, frames)`` writes the
-frames of a running environment (Pillow). ``draw_plan(problem, plan)`` draws the routes of a plan,
+joint_actions)`` plays an episode into an animated GIF, ``animate_plans(path, problem, plans)``
+several plans side by side, and ``save_gif(path, frames)`` writes the frames of a running
+environment (Pillow). ``draw_plan(problem, plan)`` draws the routes of a plan,
 ``compare_plans(problem, plans)`` several side by side, and ``save_figure(figure, path)`` keeps them
 (matplotlib).
 """
@@ -24,10 +25,12 @@ if TYPE_CHECKING:
     from mapp_env.rendering.comparison import compare_plans
     from mapp_env.rendering.figures import draw_plan, save_figure
     from mapp_env.rendering.human import Window
+    from mapp_env.rendering.side_by_side import animate_plans
 
 __all__ = [
     "Scene",
     "Window",
+    "animate_plans",
     "ansi",
     "compare_plans",
     "draw_plan",
@@ -39,6 +42,7 @@ __all__ = [
 
 _LAZY = {
     "Window": "mapp_env.rendering.human",
+    "animate_plans": "mapp_env.rendering.side_by_side",
     "compare_plans": "mapp_env.rendering.comparison",
     "draw_plan": "mapp_env.rendering.figures",
     "save_animation": "mapp_env.rendering.animation",

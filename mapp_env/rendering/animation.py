@@ -20,7 +20,7 @@ from mapp_env.simulation import Simulation
 from mapp_env.task import Task
 from mapp_env.validation import check_count, check_flag, describe
 
-__all__ = ["MAX_FRAMES", "MAX_PIXELS", "save_animation", "save_gif"]
+__all__ = ["MAX_FRAMES", "MAX_PIXELS", "save_animation", "save_gif", "scenes"]
 
 MAX_FRAMES = 2_000
 MAX_PIXELS = 1 << 28  # of all frames together: 960 of the default grid; they are kept in memory
@@ -78,7 +78,7 @@ def save_animation(
     """
     side = check_count("max_side", max_side, 16, 1024)
     actions = replay(problem, joint_actions).actions
-    frames = (rgb_array(scene, side) for scene in _scenes(problem, actions))
+    frames = (rgb_array(scene, side) for scene in scenes(problem, actions))
     return _save(path, frames, fps, hold, loop, len(actions) + 1)
 
 
@@ -134,7 +134,7 @@ def _save(
     return len(data)
 
 
-def _scenes(problem: Problem, actions: tuple[tuple[int, ...], ...]) -> Iterator[Scene]:
+def scenes(problem: Problem, actions: tuple[tuple[int, ...], ...]) -> Iterator[Scene]:
     """Yield what the environment would show of an episode."""
     limit = problem.max_cycles if problem.max_cycles is not None else max(len(actions), 1)
     task = Task(

@@ -13,11 +13,10 @@ from mapp_env.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering.figures import DPI, Panel, costs_of, draw_plan, save_figure
 from mapp_env.rendering.palette import INK, to_hex
-from mapp_env.validation import describe
+from mapp_env.rendering.rivals import check_plans, gaps
 
-__all__ = ["compare_plans", "gaps"]
+__all__ = ["compare_plans"]
 
-MAX_PLANS = 12
 MAX_LABEL = 60  # characters
 COLUMNS = 3
 LARGE_SIDE = 7.0  # inches, of a map with many cells
@@ -55,7 +54,7 @@ def compare_plans(
         If an argument is not as said, a plan is not one of this problem or costs less than the
         proven optimum, or the file cannot be written.
     """
-    _check(problem, plans)
+    check_plans(problem, plans)
     if path is not None:
         check_writable(path)
     notes = gaps(plans)
@@ -85,52 +84,3 @@ def compare_plans(
     if path is not None:
         save_figure(figure, path)
     return figure
-
-
-def gaps(plans: Mapping[str, Plan]) -> dict[str, str]:
-    """Return for each plan how far it is from those that are proven optimal, in words.
-
-    Raises
-    ------
-    ValueError
-        If a plan costs less than what is said to be the optimum.
-    """
-    optima = {plan.objective: plan.cost for plan in plans.values() if plan.status == "optimal"}
-    notes = {}
-    for label, plan in plans.items():
-        parts = []
-        for objective, optimum in optima.items():
-            name = objective.replace("_", " ")
-            cost = getattr(plan, objective)
-            if cost < optimum:
-                raise ValueError(
-                    f"plans[{describe(label)}] has {name} {cost}, below {optimum}, which another "
-                    "plan has as the proven optimum"
-                )
-            if plan.success and (plan.status, plan.objective) != ("optimal", objective):
-                gap = (cost - optimum) / optimum
-                parts.append(f"{name}: gap {gap:.1%} to the optimum {optimum:g}")
-        notes[label] = ", ".join(parts)
-    return notes
-
-
-def _check(problem: object, plans: object) -> None:
-    if not isinstance(problem, Problem):
-        raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
-    if not isinstance(plans, Mapping) or not 1 <= len(plans) <= MAX_PLANS:
-        raise ValueError(
-            f"plans must be a mapping of 1 to {MAX_PLANS} labels to plans, got {describe(plans)}"
-        )
-    for label, plan in plans.items():
-        if not isinstance(label, str):
-            raise ValueError(f"plans must have strings as labels, got {describe(label)}")
-        if not isinstance(plan, Plan):
-            raise ValueError(
-                f"plans[{describe(label)}] must be a mapp_env.Plan, got {describe(plan)}"
-            )
-        own = plan.problem
-        same = own is None or (
-            own.grid == problem.grid and set(own.landmarks) == set(problem.landmarks)
-        )
-        if not same or len(plan.tours) != problem.n_agents:
-            raise ValueError(f"plans[{describe(label)}] is a plan of another problem")

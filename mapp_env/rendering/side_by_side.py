@@ -1,0 +1,129 @@
+"""Plans of one problem played side by side in one animated GIF, with Pillow."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.plan import Plan
+from mapp_env.problem import Problem
+from mapp_env.rendering import icons
+from mapp_env.rendering.animation import save_gif, scenes
+from mapp_env.rendering.palette import INK, PAPER, blend
+from mapp_env.rendering.rgb_array import rgb_array
+from mapp_env.rendering.rivals import check_plans, gaps
+from mapp_env.validation import check_count
+
+__all__ = ["animate_plans"]
+
+BETWEEN = 12  # pixels between two panels
+INSET = 12  # pixels left of a caption
+LINE = 20  # pixels of a caption's line
+CAPTION = 2 * LINE + 12
+QUIET = blend(INK, PAPER, 0.65)
+
+Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
+
+
+def animate_plans(
+    path: str | os.PathLike[str],
+    problem: Problem,
+    plans: Mapping[str, Plan],
+    fps: float = 4,
+    hold: float = 2.0,
+    loop: bool = True,
+    max_side: int = 384,
+) -> int:
+    """Play plans of one problem side by side and write them as an animated GIF.
+
+    Above each stand its label and, once it is through, what it cost; if another of the plans is
+    proven optimal, its gap to that one: (cost - optimum) / optimum. All start together, and whoever
+    is through waits for the others.
+
+    Parameters
+    ----------
+    path : str or os.PathLike
+        The file; replaced if it is there.
+    problem : Problem
+        What they are plans of.
+    plans : mapping of str to Plan
+        1 to 12, by what they are called: ``{"policy": ..., "optimum": ...}``.
+    fps, hold, loop
+        As of :func:`~mapp_env.rendering.animation.save_animation`.
+    max_side : int
+        Pixels that the longer side of one grid may take, 16 to 1024.
+
+    Returns
+    -------
+    int
+        Size of the file in bytes.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as said, a plan is not one of this problem or costs less than the
+        proven optimum, the animation would be too large, or the file cannot be written.
+    """
+    check_plans(problem, plans)
+    side = check_count("max_side", max_side, 16, 1024)
+    notes = gaps(plans)
+    panels = [
+        _panel(problem, plan, label, _outcome(plan, notes[label]), side)
+        for label, plan in plans.items()
+    ]
+    return save_gif(path, _together(panels), fps, hold, loop)
+
+
+def _outcome(plan: Plan, note: str) -> str:
+    """Return what stands above a plan that is through."""
+    if not plan.success:
+        return "not every landmark is visited"
+    proven = " (proven)" if plan.status == "optimal" and plan.objective == "cover_time" else ""
+    gap = f" ({_gap(note)})" if note.startswith("cover time") else ""
+    return f"cover time {plan.cover_time}{proven or gap}, total distance {plan.total_distance}"
+
+
+def _gap(note: str) -> str:
+    """Return "gap 8.3%" of what :func:`gaps` says first."""
+    return note[note.index("gap") : note.index("%") + 1]
+
+
+def _panel(problem: Problem, plan: Plan, label: str, outcome: str, side: int) -> Iterator[Frame]:
+    """Yield the frames of one plan."""
+    last = len(plan.actions)
+    for step, scene in enumerate(scenes(problem, plan.actions)):
+        frame = rgb_array(scene, side)
+        yield np.vstack([_caption(label, outcome if step == last else "", frame.shape[1]), frame])
+
+
+def _caption(label: str, outcome: str, width: int) -> Frame:
+    """Return a strip with two lines of text, cut off where they are too wide."""
+    strip = np.empty((CAPTION, width, 3), np.uint8)
+    strip[:] = INK
+    for line, (string, colour) in enumerate(((label, PAPER), (outcome, QUIET))):
+        if string:
+            icon = icons.text(string, LINE, colour)[:, : width - 2 * INSET]
+            top = 6 + line * LINE
+            below = strip[top : top + icon.shape[0], INSET : INSET + icon.shape[1]]
+            alpha = icon[:, :, 3:].astype(np.uint16)
+            below[:] = (icon[:, :, :3] * alpha + below * (255 - alpha) + 127) // 255
+    return strip
+
+
+def _together(panels: list[Iterator[Frame]]) -> Iterator[Frame]:
+    """Yield frames with all panels beside each other until the last of them ends."""
+    shown = [next(panel) for panel in panels]
+    gap = np.full((shown[0].shape[0], BETWEEN, 3), PAPER, np.uint8)
+    while True:
+        row: list[Frame] = []
+        for frame in shown:
+            row += [gap, frame] if row else [frame]
+        yield np.hstack(row)
+        following = [next(panel, None) for panel in panels]
+        if all(frame is None for frame in following):
+            return
+        shown = [old if new is None else new for old, new in zip(shown, following, strict=True)]
