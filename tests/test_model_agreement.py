@@ -106,7 +106,7 @@ def test_cases_are_not_vacuous() -> None:
         seen[f"{case.reward}, wait {case.allow_wait}"] += 1
         seen["idle agent"] += model.terminated and not all(model.claimed)
         seen["two claims"] += any(len(claims) > 1 for claims in model.claimed)
-    assert len(seen) == 11 + 6
+    assert len(seen) == 11 + 2 * len(REWARDS)
     assert all(count >= 2 for count in seen.values()), seen
 
 
@@ -304,7 +304,7 @@ def test_vector_rows_play_the_model(setting: int) -> None:
     case = the_case((0, 4, 5, 8, 27, 7, 10, 1)[setting])
     rng = random.Random(setting)
     settings = case.settings()
-    reward, allow_wait = REWARDS[setting % 3], bool(setting % 2)
+    reward, allow_wait = REWARDS[setting % len(REWARDS)], bool(setting % 2)
     settings.update(max_cycles=(5, 30, 50)[setting % 3], reward=reward, allow_wait=allow_wait)
     n_rows = 6 if len(case.landmarks) == 64 else N_ROWS
     n_agents, n_landmarks = case.n_agents, len(case.landmarks)

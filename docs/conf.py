@@ -1,0 +1,58 @@
+"""How Sphinx builds these pages: ``sphinx-build -W --keep-going -b html docs docs/_build/html``.
+
+The pages are written to be read on GitHub as well, so little beyond plain Markdown is used.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import mapp_env
+
+HERE = Path(__file__).parent
+PLAYGROUND = "playground"  # a page by itself, with scripts: copied as it is
+
+project = "mapp_env"
+author = "The mapp_env authors"
+project_copyright = author
+version = release = mapp_env.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build", PLAYGROUND]
+myst_heading_anchors = 4  # links such as solvers.md#files, as GitHub makes them
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # docstrings say types, shapes and units
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+
+html_theme = "furo"
+html_title = f"mapp_env {release}"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
+html_copy_source = False
+html_show_sphinx = False
+
+
+def link_to_playground(_app: Any, _page: str, source: list[str]) -> None:
+    """Make links into the playground plain ones: MyST would offer its files for download."""
+    source[0] = re.sub(
+        rf"(?<!!)\[([^\]]*)\]\(({PLAYGROUND}/[^)\s]*)\)", r'<a href="\2">\1</a>', source[0]
+    )
+
+
+def copy_playground(app: Any, error: Exception | None) -> None:
+    """Copy the playground beside the pages, if it is there."""
+    folder = HERE / PLAYGROUND
+    if error is None and app.builder.format == "html" and folder.is_dir():
+        shutil.copytree(folder, Path(app.outdir) / PLAYGROUND, dirs_exist_ok=True)
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Hand the two functions above to Sphinx."""
+    app.connect("source-read", link_to_playground)
+    app.connect("build-finished", copy_playground)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
