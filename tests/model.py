@@ -355,7 +355,12 @@ def random_case(seed: int) -> Case:
     rows = random_rows(rng, n_rows, n_cols, n_landmarks)
     landmarks = tuple(rng.sample(landmark_cells(rows), n_landmarks))
     model = Model(
-        rows, landmarks, n_agents, REWARDS[seed % len(REWARDS)], bool(seed // 3 % 2), max_cycles=max_cycles
+        rows,
+        landmarks,
+        n_agents,
+        REWARDS[seed % len(REWARDS)],
+        bool(seed // 3 % 2),
+        max_cycles=max_cycles,
     )
     actions = []
     while not model.ended:

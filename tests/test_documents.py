@@ -9,10 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-DOCUMENTS = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+DOCS = REPOSITORY / "docs"
+DOCUMENTS = [REPOSITORY / "README.md", *sorted(DOCS.glob("*.md"))]
 EXAMPLES = {
     "quickstart.py": [],
     "rollout.py": ["--out", "{folder}/rollout.gif"],
@@ -59,8 +62,6 @@ def test_example_runs(name: str, tmp_path: Path) -> None:
 
 def test_rollout_writes_an_animation(tmp_path: Path) -> None:
     """The rollout's file is a GIF with a picture for the reset and one for each step."""
-    from PIL import Image
-
     target = tmp_path / "episode.gif"
     script = REPOSITORY / "examples" / "rollout.py"
     output = run([sys.executable, str(script), "--out", str(target)], tmp_path)
@@ -98,16 +99,109 @@ def test_pages_code_runs(path: Path, tmp_path: Path) -> None:
     promised = re.findall(r"^print\(.*\)  # (.*)$", "\n".join(blocks), re.MULTILINE)
     assert len(printed) == len(promised)
     for line, promise in zip(printed, promised, strict=True):
-        if promise[0].isdigit() or promise[0] in "[(":
+        if re.match(r"[\d\[(-]|True$|False$|None$|[A-Z]\w*\(", promise):
             assert line == promise
+    for picture in tmp_path.glob("*.png"):
+        with (
+            Image.open(picture) as drawn,
+            Image.open(REPOSITORY / "docs" / "images" / picture.name) as shown,
+        ):
+            pixels = [np.array(image.convert("RGB"), int) for image in (drawn, shown)]
+        assert pixels[0].shape == pixels[1].shape
+        assert abs(pixels[0] - pixels[1]).mean() < 0.5, f"{picture.name} is out of date"
+
+
+def all_tests() -> str:
+    """Return the text of all test files."""
+    files = sorted(Path(__file__).parent.glob("test_*.py"))
+    return "\n".join(path.read_text(encoding="utf-8") for path in files)
+
+
+def tables(path: Path) -> list[list[list[str]]]:
+    """Return a document's tables: rows of cells, the header first, the ruler left out."""
+    found = re.findall(r"(?:^\|.*\|\n)+", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return [
+        [
+            [cell.strip() for cell in line.strip("|").split("|")]
+            for index, line in enumerate(block.splitlines())
+            if index != 1
+        ]
+        for block in found
+    ]
+
+
+def test_promises_name_tests_that_exist() -> None:
+    """Each promise of the page about reliability names tests of the suite, and all exist."""
+    tests = all_tests()
+    rows = [row for table in tables(DOCS / "reliability.md") for row in table[1:]]
+    assert len(rows) >= 30
+    for promise, names in rows:
+        found = re.findall(r"`(test_\w+)`", names)
+        assert found, promise
+        for name in found:
+            assert f"def {name}(" in tests, f"{promise}: {name}"
+
+
+def test_tables_shown_twice_agree() -> None:
+    """Rows of equal labels under equal headers are equal, wherever a table is repeated."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    twice = 0
+    for path in DOCUMENTS:
+        for header, *body in tables(path):
+            if not any(cell[:1].isdigit() for row in body for cell in row[1:]):
+                continue  # words
+            labels = 2 if header[:2] == ["preset", "learner"] else 1
+            keys = [(*header, *row[:labels]) for row in body]
+            for key, row in zip(keys, body, strict=True):
+                if keys.count(key) == 1:
+                    twice += key in rows
+                    assert rows.setdefault(key, row) == row, f"{path.name}: {row}"
+    assert twice >= 10
+
+
+def test_each_logged_metric_is_explained() -> None:
+    """The page about the baselines has a row for every column and entry that a run writes."""
+    training = importlib.import_module("baselines.training")
+    evaluation = importlib.import_module("baselines.evaluation")
+    setting = evaluation.Setting(importlib.import_module("mapp_env").make_grid())
+    table = evaluation.evaluate(
+        importlib.import_module("baselines.policy").NearestLandmarkPolicy(setting.grid, 3, 5),
+        setting,
+        np.array([[0, 6, 20, 42, 48]]),
+    )
+    (metrics, evaluated) = [
+        [row[0].strip("`") for row in rows[1:]]
+        for rows in tables(DOCS / "baselines.md")
+        if rows[0] == ["column", "unit", "what"]
+    ]
+    assert metrics == list(training.METRICS)
+    assert evaluated == list(table.summary())
+    (timing,) = [
+        rows for rows in tables(DOCS / "baselines.md") if rows[0] == ["entry", "unit", "what"]
+    ]
+    laps = set()
+    for name in ("training", "experiment"):
+        source = (REPOSITORY / "baselines" / f"{name}.py").read_text(encoding="utf-8")
+        laps |= set(re.findall(r"\.lap\(\"([^\"]+)\"\)", source))
+    assert len(laps) >= 5
+    (seconds,) = [row[2] for row in timing if row[0] == "`seconds`"]
+    assert laps == set(re.findall(r"`([^`]+)`", seconds))
+
+
+def test_code_blocks_say_what_they_are() -> None:
+    """Every block is Python or a command, which are run, or else text that nobody could run."""
+    known = {"python", "bash", "text", "markdown", "{toctree}", "{eval-rst}"}
+    for path in DOCUMENTS:
+        fences = re.findall(r"^\s*```(.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+        assert len(fences) % 2 == 0, path.name
+        assert set(fences[::2]) <= known, path.name
+        assert set(fences[1::2]) <= {""}, path.name
 
 
 def test_rules_table_names_what_exists() -> None:
     """Each rule's row names functions of the package and tests of the suite."""
-    text = (REPOSITORY / "docs" / "env.md").read_text(encoding="utf-8")
-    tests = "\n".join(
-        path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py")
-    )
+    text = (REPOSITORY / "docs" / "rules.md").read_text(encoding="utf-8")
+    tests = all_tests()
     rows = re.findall(r"^\| (R\d) \|.*\| (.*?) \| (.*?) \|$", text, re.MULTILINE)
     assert [rule for rule, _, _ in rows] == [f"R{number}" for number in range(1, 10)]
     for rule, functions, names in rows:

@@ -1,0 +1,77 @@
+"""The documentation as a site: built with warnings as errors, with every page and public name."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+import mapp_env
+from mapp_env import rendering
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DOCS = REPOSITORY / "docs"
+
+if importlib.util.find_spec("sphinx") is None:
+    pytest.skip("the extra 'docs' is not installed", allow_module_level=True)
+
+
+def build(docs: Path, site: Path) -> subprocess.CompletedProcess[str]:
+    """Build the site in a process of its own, as the documents say it is built."""
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
+    return subprocess.run(
+        [*command, str(docs), str(site)],
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        timeout=240,
+        check=False,
+    )
+
+
+def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    """A page for every document, a docstring for every public name, and all pictures."""
+    docs, site = tmp_path / "docs", tmp_path / "site"
+    # A copy with a playground: where there is none yet, it is to be taken along all the same.
+    shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("_build"))
+    for name in ("examples", "README.md", "CHANGELOG.md"):
+        (tmp_path / name).symlink_to(REPOSITORY / name)
+    (docs / "playground").mkdir(exist_ok=True)
+    (docs / "playground" / "probe.js").write_text("0;\n", encoding="utf-8")
+    with (docs / "glossary.md").open("a", encoding="utf-8") as page:
+        page.write("\n[to play with](playground/probe.js)\n")
+    done = build(docs, site)
+    assert (done.returncode, done.stderr) == (0, "")
+    for page in DOCS.glob("*.md"):
+        assert (site / f"{page.stem}.html").is_file(), page.name
+    reference = (site / "api.html").read_text(encoding="utf-8")
+    for name in mapp_env.__all__:
+        if name not in ("__version__", "mapp_v0", "solvers"):
+            assert re.search(rf'id="mapp_env\.(\w+\.)*{name}"', reference), name
+    for name in rendering.__all__:
+        assert re.search(rf'id="mapp_env\.rendering\.(\w+\.)*{name}"', reference), name
+    index = unescape((site / "index.html").read_text(encoding="utf-8"))
+    assert f"mapp_env {mapp_env.__version__}" in index
+    assert (site / "playground" / "probe.js").read_text(encoding="utf-8") == "0;\n"
+    assert 'href="playground/probe.js"' in (site / "glossary.html").read_text(encoding="utf-8")
+
+
+def test_a_broken_link_is_an_error(tmp_path: Path) -> None:
+    """A link to a heading that is not there stops the building of the site."""
+    (tmp_path / "docs").mkdir()
+    for name in ("conf.py", "_static"):
+        source = DOCS / name
+        copy = shutil.copytree if source.is_dir() else shutil.copy
+        copy(source, tmp_path / "docs" / name)
+    page = "# Page\n\n[here](#no-such-heading)\n"
+    (tmp_path / "docs" / "index.md").write_text(page, encoding="utf-8")
+    done = build(tmp_path / "docs", tmp_path / "site")
+    assert done.returncode != 0
+    assert "no-such-heading" in done.stderr
