@@ -66,7 +66,7 @@ def in_sentences() -> list[str]:
     found: dict[str, None] = {}
     for path in DOCUMENTS:
         prose = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
-        for command in re.findall(r"`(python [^`]* -[^`]*)`", prose):
+        for command in re.findall(r"`(python\s[^`]*\s-[^`]*)`", prose):
             words = shlex.split(command)
             if words[1].endswith(".py") and len(words) > 2:
                 found[shlex.join(words)] = None

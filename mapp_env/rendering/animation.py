@@ -54,7 +54,7 @@ def save_animation(
     problem : Problem
         What is played.
     joint_actions : array_like of int, shape (T, N)
-        As :func:`~mapp_env.plan.replay` takes them; ``plan.joint_actions()`` gives a plan's.
+        As :func:`~mapp_env.replay` takes them; ``plan.joint_actions()`` gives a plan's.
     fps : float
         Frames a second, 0.1 to 50.
     hold : float

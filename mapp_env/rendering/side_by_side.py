@@ -53,7 +53,7 @@ def animate_plans(
     plans : mapping of str to Plan
         1 to 12, by what they are called: ``{"policy": ..., "optimum": ...}``.
     fps, hold, loop
-        As of :func:`~mapp_env.rendering.animation.save_animation`.
+        As of :func:`~mapp_env.rendering.save_animation`.
     max_side : int
         Pixels that the longer side of one grid may take, 16 to 1024.
 
