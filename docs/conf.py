@@ -37,6 +37,14 @@ html_copy_source = False
 html_show_sphinx = False
 
 
+def list_pages(_app: Any, page: str, source: list[str]) -> None:
+    """Make the front page's list, a group an item, the navigation of the site."""
+    if page == "index":
+        for group, links in re.findall(r"^- ([^:\[\n]+):((?:.|\n )*)", source[0], re.MULTILINE):
+            pages = "\n".join(re.findall(r"\]\((\w+)\.md\)", links))
+            source[0] += f"\n```{{toctree}}\n:hidden:\n:caption: {group}\n\n{pages}\n```\n"
+
+
 def link_to_playground(_app: Any, _page: str, source: list[str]) -> None:
     """Make links into the playground plain ones: MyST would offer its files for download."""
     source[0] = re.sub(
@@ -52,7 +60,8 @@ def copy_playground(app: Any, error: Exception | None) -> None:
 
 
 def setup(app: Any) -> dict[str, bool]:
-    """Hand the two functions above to Sphinx."""
+    """Hand the functions above to Sphinx."""
+    app.connect("source-read", list_pages)
     app.connect("source-read", link_to_playground)
     app.connect("build-finished", copy_playground)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
