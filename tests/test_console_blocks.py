@@ -47,18 +47,17 @@ class Understood(BaseException):
     """A script's own parser has taken a command; no error, so that no script catches it."""
 
 
-def in_blocks() -> list[str]:
-    """Return the commands of all ``bash`` blocks, each once, as one would type them."""
-    found: dict[str, None] = {}
-    for path in DOCUMENTS:
-        for block in re.findall(r"```bash\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
-            for line in block.replace("\\\n", " ").splitlines():
-                for part in line.split("&&"):
-                    words = shlex.split(part, comments=True)
-                    if words:
-                        words[0] = re.sub(r"^(\.venv/bin/)?(python)3?$", r"\2", words[0])
-                        found[shlex.join([words[0].removeprefix(".venv/bin/"), *words[1:]])] = None
-    return list(found)
+def in_blocks(path: Path) -> list[str]:
+    """Return the commands of a document's ``bash`` blocks, in order, as one would type them."""
+    found = []
+    for block in re.findall(r"```bash\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL):
+        for line in block.replace("\\\n", " ").splitlines():
+            for part in line.split("&&"):
+                words = shlex.split(part, comments=True)
+                if words:
+                    words[0] = re.sub(r"^(\.venv/bin/)?(python)3?$", r"\2", words[0])
+                    found.append(shlex.join([words[0].removeprefix(".venv/bin/"), *words[1:]]))
+    return found
 
 
 def in_sentences() -> list[str]:
@@ -82,18 +81,26 @@ def why_not_run(command: str) -> str | None:
     return None
 
 
-CHEAP = [command for command in in_blocks() if why_not_run(command) is None]
-LONG = [command for command in in_blocks() if why_not_run(command)]
+CHEAP = {
+    path.name: [command for command in in_blocks(path) if why_not_run(command) is None]
+    for path in DOCUMENTS
+}
+LONG = sorted({c for path in DOCUMENTS for c in in_blocks(path) if why_not_run(c)})
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
 # -- running -----------------------------------------------------------------------------------
 
 
 def start(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Carry out ``python SCRIPT ...`` or ``python -m MODULE ...`` in this process."""
+    """Carry out ``python SCRIPT ...``, ``python -m MODULE ...`` or a console script's command."""
     words = shlex.split(command)
-    assert words[0] == "python", f"{command}: how is this run?"
     monkeypatch.setattr(os, "environ", os.environ.copy())
+    if words[0] in PROJECT["scripts"]:
+        module, function = PROJECT["scripts"][words[0]].split(":")
+        monkeypatch.setattr(sys, "argv", words)
+        sys.exit(getattr(importlib.import_module(module), function)())
+    assert words[0] == "python", f"{command}: how is this run?"
     if words[1] == "-m":
         monkeypatch.setattr(sys, "argv", words[2:])
         runpy.run_module(words[2], run_name="__main__", alter_sys=True)
@@ -110,22 +117,35 @@ def frames(path: Path) -> np.ndarray:
         return np.array([np.array(f.convert("RGB")) for f in ImageSequence.Iterator(image)])
 
 
-@pytest.mark.parametrize("command", CHEAP)
-def test_cheap_commands_run(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    """Each ends well, prints something, and draws the pictures that the documents show."""
-    (tmp_path / "docs" / "images").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
+def finish(command: str) -> None:
+    """Carry out a command to its end, and leave this process as it was.
+
+    Raises
+    ------
+    AssertionError
+        If it ends with an exit code.
+    """
     threads, code = torch.get_num_threads(), None
     try:
-        start(command, monkeypatch)
+        with pytest.MonkeyPatch.context() as patch:
+            start(command, patch)
     except SystemExit as ended:
         code = ended.code
     finally:
         torch.set_num_threads(threads)
-    assert not code
-    assert capsys.readouterr().out.strip()
+    assert not code, f"{command}: {code}"
+
+
+@pytest.mark.parametrize("page", [page for page, commands in CHEAP.items() if commands])
+def test_cheap_commands_run(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """One after the other each ends well, prints something, and draws what the page shows."""
+    (tmp_path / "docs" / "images").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    for command in CHEAP[page]:
+        finish(command)
+        assert capsys.readouterr().out.strip(), command
     for picture in (tmp_path / "docs" / "images").iterdir():
         shown = frames(REPOSITORY / "docs" / "images" / picture.name)
         drawn = frames(picture)
@@ -165,12 +185,11 @@ def read_installation(words: list[str]) -> None:
     parser.add_argument("-e", dest="project")
     parser.add_argument("packages", nargs="*")
     taken = parser.parse_args(words)
-    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert taken.constraints is None or (REPOSITORY / taken.constraints).is_file()
     for wanted in filter(None, [taken.project, *taken.packages]):
         name, extras = re.fullmatch(r"([\w.-]+)(?:\[([\w,]+)\])?", wanted).groups()
-        assert name in (".", project["name"]), f"{wanted}: not this project"
-        assert set(filter(None, (extras or "").split(","))) <= {*project["optional-dependencies"]}
+        assert name in (".", PROJECT["name"]), f"{wanted}: not this project"
+        assert set(filter(None, (extras or "").split(","))) <= {*PROJECT["optional-dependencies"]}
 
 
 @pytest.mark.parametrize("command", LONG)
@@ -201,7 +220,7 @@ def test_commands_in_sentences_are_understood(
 
 def test_nothing_is_left_out_without_need() -> None:
     """Commands are found, and each entry of the list above is there for one of them."""
-    assert len(CHEAP) >= 5
+    assert sum(map(len, CHEAP.values())) >= 8
     assert len(LONG) >= 20
     assert len(in_sentences()) >= 8
     for entry in NOT_RUN:
