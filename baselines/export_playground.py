@@ -1,0 +1,167 @@
+"""Write a trained policy's weights for the page in docs/playground.
+
+Command::
+
+    python baselines/export_playground.py                       # of the policy `pretrained`
+    python baselines/export_playground.py --policy runs/mine --out docs/playground/weights.js
+
+Output: a script of one assignment, so that the page can be opened as a file. It holds the network's
+spec, the grid, the name and checksum of the source and the weights: 16-bit floats, little-endian,
+in base64. Of tables that have a row for every pair of cells only those rows are written that an
+episode can look up. The same policy gives the same bytes.
+"""
+
+import base64
+import hashlib
+import itertools
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from baselines.networks import NetworkSpec
+from baselines.policy import find_weights
+from baselines.runs import write_atomically
+from baselines.settings import Setting
+from baselines.solve import load
+from mapp_env import Grid, make_grid
+
+PLAYGROUND = Path(__file__).resolve().parents[1] / "docs" / "playground"
+COMMAND = "python baselines/export_playground.py"
+
+
+@dataclass
+class Args:
+    """Options of an export."""
+
+    policy: str = "pretrained"
+    """a pretrained policy's name or a run folder"""
+    out: Path = PLAYGROUND / "weights.js"
+    """the script to write"""
+
+
+def export(policy: str) -> str:
+    """Return the script that holds a policy's weights.
+
+    Raises
+    ------
+    ValueError
+        If there is no such policy, or the page cannot run it: it is of another setting or kind,
+        or has weights that 16 bits have no room for.
+    """
+    trained, setting = load(policy)
+    check_setting(policy, setting)
+    check_network(policy, trained.spec)
+    file = find_weights(policy)
+    rows = kept_rows(trained.spec, setting.grid)
+    tensors = {}
+    for name, tensor in sorted(trained.network.state_dict().items()):
+        if tensor.abs().max() > torch.finfo(torch.float16).max:
+            raise ValueError(f"policy {policy!r}: {name} holds more than 16 bits have room for")
+        values = tensor.numpy()
+        table = name.removesuffix(".weight")
+        values = (values[rows[table]] if table in rows else values).astype("<f2")
+        data = base64.b64encode(values.tobytes()).decode()
+        tensors[name] = {"shape": list(values.shape), "data": data}
+    about = {
+        "name": file.parent.name,
+        "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
+        "grid": setting.grid.to_text(),
+        "max_cycles": setting.max_cycles,
+        "spec": trained.spec.as_dict(),
+        "tensors": tensors,
+    }
+    fields = ",\n".join(f"{json.dumps(name)}: {_lines(about[name])}" for name in about)
+    return (
+        f"// Made by `{COMMAND}`, do not edit.\n"
+        f'"use strict";\n\n(window.mapp = window.mapp || {{}}).policy = {{\n{fields}\n}};\n'
+    )
+
+
+def _lines(value: object) -> str:
+    """Return JSON with a line for each tensor."""
+    if not isinstance(value, dict) or not all(isinstance(item, dict) for item in value.values()):
+        return json.dumps(value)
+    entries = ",\n".join(f"{json.dumps(name)}: {json.dumps(item)}" for name, item in value.items())
+    return f"{{\n{entries}\n}}"
+
+
+def check_setting(policy: str, setting: Setting) -> None:
+    """Refuse a policy that was trained for something else than the page shows.
+
+    Raises
+    ------
+    ValueError
+        If grid, number of agents, landmarks or step limit differ from the default setting's.
+    """
+    shown = Setting(make_grid())
+    if setting.grid != shown.grid:
+        raise ValueError(f"policy {policy!r} is of another grid than the page's, paper-7x7")
+    for name in ("n_agents", "n_landmarks", "max_cycles"):
+        found, wanted = getattr(setting, name), getattr(shown, name)
+        if found != wanted:
+            raise ValueError(f"policy {policy!r} has {name}={found}, the page {wanted}")
+
+
+def check_network(policy: str, spec: NetworkSpec) -> None:
+    """Refuse a network that the page has no code for.
+
+    Raises
+    ------
+    ValueError
+        If it is not one network of kind "pairs" for all agents, with joint outputs.
+    """
+    for name, wanted in {"kind": "pairs", "outputs": "joint", "team": "one"}.items():
+        found = getattr(spec, name)
+        if found != wanted:
+            raise ValueError(
+                f"policy {policy!r} has a network with {name}={found!r}, the page runs {wanted!r}"
+            )
+
+
+def kept_rows(spec: NetworkSpec, grid: Grid) -> dict[str, np.ndarray]:
+    """Return for each big table the rows that an episode can look up, in the order of the file.
+
+    Landmarks are free cells but the depot; agents stand on these or on the depot, and never on an
+    unvisited landmark. The page lists the rows in the same way (``keptRows`` in network.js), and
+    :mod:`baselines.lookups` numbers them.
+    """
+    c = spec.n_cells
+    landmarks = grid.reachable.tolist()
+    cells = sorted([*landmarks, grid.depot])
+    places = [*landmarks, c]
+    pairs = [cell * (c + 2) + place for cell in cells for place in places if place != cell]
+    slots = [slot * c * (c + 2) for slot in range(spec.n_agents)]
+    n_two = c * (c - 1) // 2
+    routes = [
+        cell * n_two + high * (high - 1) // 2 + low
+        for cell in cells
+        for high, low in itertools.product(landmarks, repeat=2)
+        if low < high and cell not in (low, high)
+    ]
+    rows = {
+        "pairs": [*pairs, *(cell * (c + 2) + c + 1 for cell in cells)],
+        "unvisited": places,
+        "crossed": [slot + row for slot in slots for row in pairs],
+        "between": [one * (c + 1) + other for one, other in itertools.product(places, repeat=2)],
+        "routes": [*routes, c * n_two],
+    }
+    return {name: np.array(numbers) for name, numbers in rows.items()}
+
+
+def main(args: Args) -> None:
+    """Write the script."""
+    script = export(args.policy).encode()
+    write_atomically(args.out, script)
+    print(f"{args.out}: {len(script) / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Args, description=__doc__))
+    except (ValueError, OSError) as error:
+        sys.exit(f"error: {error}")
