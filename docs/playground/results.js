@@ -26,22 +26,17 @@
     const best = optimum.coverTime;
     if (!network.success) {
       const names = network.left.map((cell) => mapp.letter(flags.indexOf(cell))).join(" and ");
-      const some = network.left.length === 1 ? "flag" : "flags";
-      return {
-        kind: "unsolved",
-        text: `Unsolved: at the limit of ${network.steps} steps the network has not visited ${some} ${names}. The optimum takes ${count(best, "step")}.`,
-      };
+      const left = network.left.length === 1 ? `flag ${names} is` : `flags ${names} are`;
+      const text = `Unsolved: at the limit of ${network.steps} steps ${left} left. The optimum takes ${best}.`;
+      return { kind: "unsolved", text };
     }
     if (network.coverTime > best) {
-      return {
-        kind: "gap",
-        text: `The network takes ${count(network.coverTime, "step")}, the proven optimum is ${best}: a gap of ${percent(gapOf(network, optimum))}.`,
-      };
+      const gap = percent(gapOf(network, optimum));
+      const text = `Gap ${gap}: the network takes ${network.coverTime} steps, the proven optimum ${best}.`;
+      return { kind: "gap", text };
     }
-    return {
-      kind: "optimal",
-      text: `The network is optimal here: all ${inWords(flags.length)} flags in ${count(best, "step")}, and no plan is faster.`,
-    };
+    const all = `all ${inWords(flags.length)} flags in ${count(best, "step")}`;
+    return { kind: "optimal", text: `Optimal: ${all}, and no plan is faster.` };
   }
 
   /** Fill in the table of costs; plans may be null. */
