@@ -4,11 +4,13 @@ Command::
 
     python baselines/export_playground.py                       # of the policy `pretrained`
     python baselines/export_playground.py --policy runs/mine --out docs/playground/weights.js
+    python baselines/export_playground.py --rounding            # three minutes
 
 Output: a script of one assignment, so that the page can be opened as a file. It holds the network's
 spec, the grid, the name and checksum of the source and the weights: 16-bit floats, little-endian,
 in base64. Of tables that have a row for every pair of cells only those rows are written that an
-episode can look up. The same policy gives the same bytes.
+episode can look up. The same policy gives the same bytes. With ``--rounding`` nothing is written: it
+is counted on how many of all problems the weights' rounding changes the greedy episode.
 """
 
 import base64
@@ -23,6 +25,7 @@ import numpy as np
 import torch
 import tyro
 
+from baselines.evaluation import evaluate, every_problem
 from baselines.networks import NetworkSpec
 from baselines.policy import find_weights
 from baselines.runs import write_atomically
@@ -42,6 +45,8 @@ class Args:
     """a pretrained policy's name or a run folder"""
     out: Path = PLAYGROUND / "weights.js"
     """the script to write"""
+    rounding: bool = False
+    """count the episodes that rounding changes, and write nothing"""
 
 
 def export(policy: str) -> str:
@@ -153,8 +158,34 @@ def kept_rows(spec: NetworkSpec, grid: Grid) -> dict[str, np.ndarray]:
     return {name: np.array(numbers) for name, numbers in rows.items()}
 
 
+def count_changed(policy: str) -> tuple[int, int, int]:
+    """Return how many problems there are, and on how many rounding changes actions, or steps."""
+    exact, setting = load(policy)
+    rounded, _ = load(policy)
+    with torch.no_grad():
+        for tensor in rounded.network.parameters():
+            tensor.copy_(tensor.half().float())
+    problems = every_problem(setting)
+    changed = other_steps = 0
+    for landmarks in np.array_split(problems, -(-len(problems) // 65_536)):
+        one = evaluate(exact, setting, landmarks, n_kept=len(landmarks))
+        other = evaluate(rounded, setting, landmarks, n_kept=len(landmarks))
+        steps = (one.steps != other.steps) | (one.success != other.success)
+        # Actions after the end are kept as 0, whatever the policy.
+        changed += int((steps | (one.actions != other.actions).any(axis=(0, 2))).sum())
+        other_steps += int(steps.sum())
+    return len(problems), changed, other_steps
+
+
 def main(args: Args) -> None:
-    """Write the script."""
+    """Write the script, or count what rounding changes."""
+    if args.rounding:
+        torch.set_num_threads(1)
+        total, changed, steps = count_changed(args.policy)
+        print(
+            f"of {total:,} greedy episodes {changed:,} change, {steps:,} in their steps or success"
+        )
+        return
     script = export(args.policy).encode()
     write_atomically(args.out, script)
     print(f"{args.out}: {len(script) / 1e6:.2f} MB")

@@ -36,6 +36,9 @@ OPTIONS = (
 )
 COSTS = ("cover_time", "makespan", "total_distance")
 
+# More, for a longer check of the page against the weights that it has: those rounded to 16 bits.
+N_ROUNDED = int(os.environ.get("MAPP_PLAYGROUND_PROBLEMS", "200"))
+
 # Plans of many problems, as plain lists; an infinite cost is null.
 PLAY = """problems => problems.map(landmarks => Object.fromEntries(
     Object.entries(mapp.plansOf(landmarks)).map(([name, plan]) => [name, {
@@ -88,9 +91,9 @@ def visit(browser: Browser) -> Iterator[Callable[..., Page]]:
 
 
 @cache
-def problems() -> np.ndarray:
-    """Return the same 200 problems for every policy."""
-    return sample_problems(GRID, 200, n_landmarks=5, seed=11)
+def problems(n: int = 200) -> np.ndarray:
+    """Return the same problems for every policy."""
+    return sample_problems(GRID, n, n_landmarks=5, seed=11)
 
 
 def page_with(script: str, folder: Path) -> Path:
@@ -127,6 +130,17 @@ def test_page_acts_as_the_policy(name, visit, tmp_path):
     found = visit(folder=folder).evaluate(PLAY, problems().tolist())
     for one, plan in zip(found, greedy_plans(name, problems()), strict=True):
         check_plan(one["network"], plan)
+
+
+@pytest.mark.parametrize("name", ["pretrained", "pretrained-distilled"])
+def test_page_acts_as_the_rounded_policy(name, visit, tmp_path):
+    """On as many problems as are asked for, with the same weights no action is another."""
+    save_policy(tmp_path / "policy.safetensors", load_policy(name).network, half_precision=True)
+    page = visit(folder=page_with(export(name), tmp_path / "page"))
+    for part in np.array_split(problems(N_ROUNDED), -(-N_ROUNDED // 500)):
+        found = page.evaluate(PLAY, part.tolist())
+        for one, plan in zip(found, greedy_plans(tmp_path, part), strict=True):
+            check_plan(one["network"], plan)
 
 
 def test_page_finds_the_optimum(visit):
