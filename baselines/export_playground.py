@@ -9,8 +9,8 @@ Command::
 Output: a script of one assignment, so that the page can be opened as a file. It holds the network's
 spec, the grid, the name and checksum of the source and the weights: 16-bit floats, little-endian,
 in base64. Of tables that have a row for every pair of cells only those rows are written that an
-episode can look up. The same policy gives the same bytes. With ``--rounding`` nothing is written: it
-is counted on how many of all problems the weights' rounding changes the greedy episode.
+episode can look up. The same policy gives the same bytes. With ``--rounding`` nothing is written:
+it is counted on how many of all problems the weights' rounding changes the greedy episode.
 """
 
 import base64
