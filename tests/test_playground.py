@@ -389,8 +389,11 @@ def test_readable_on_a_phone(scheme, visit):
     assert (max(map(int, floor[4:-1].split(","))) < 60) == (scheme == "dark")
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "wrong"])
-def test_damaged_weights_are_said(damage, visit, tmp_path):
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [("missing", "is missing"), ("cut", "has another length"), ("wrong", "holds what is no number")],
+)
+def test_damaged_weights_are_said(damage, said, visit, tmp_path):
     """Without readable weights the page says so, and does not break."""
     script = (PLAYGROUND / "weights.js").read_text(encoding="utf-8")
     start = script.index('"hidden.weight"')
@@ -398,8 +401,9 @@ def test_damaged_weights_are_said(damage, visit, tmp_path):
     scripts = {
         "missing": "",
         "cut": f"{script[:data]}{script[data + 8 :]}",
-        "wrong": f"{script[:data]}AH4Afg=={script[data + 8 :]}",  # not a number
+        "wrong": f"{script[:data]}AH4AfgAA{script[data + 8 :]}",  # not a number
     }
     page = visit(folder=page_with(scripts[damage], tmp_path / "page"))
     assert page.inner_text("#alert").startswith("The network cannot be read: ")
+    assert said in page.inner_text("#alert")
     assert "export_playground.py" in page.inner_text("#alert")
