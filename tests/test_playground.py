@@ -391,7 +391,7 @@ def test_readable_on_a_phone(scheme, visit):
 
 @pytest.mark.parametrize(
     ("damage", "said"),
-    [("missing", "is missing"), ("cut", "has another length"), ("wrong", "holds what is no number")],
+    [("missing", "is missing"), ("cut", "has another length"), ("wrong", "holds what is no")],
 )
 def test_damaged_weights_are_said(damage, said, visit, tmp_path):
     """Without readable weights the page says so, and does not break."""
