@@ -26,13 +26,13 @@ import sys
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import gymnasium
 import numpy as np
 import torch
 import tyro
 from torch import Tensor
 
 from baselines.checks import check_count, check_number
+from baselines.episodes import Episodes, draw_problems, make_envs, play
 from baselines.imitation import (
     ImitationOptions,
     Pupil,
@@ -43,7 +43,6 @@ from baselines.imitation import (
 from baselines.networks import Network, NetworkSpec, split_joint
 from baselines.policy import find_weights, load_policy
 from baselines.settings import Setting, check_fits, read_setting
-from mapp_env import make_vec
 
 ALGORITHM = "self_improve"
 MAX_AGAIN = 4096  # problems that wait to be played again; the oldest is forgotten
@@ -130,14 +129,7 @@ class SelfImproved(Pupil):
         check_count("alternatives", args.alternatives, 1, args.problems * args.episodes)
         super().__init__(args, network, np.random.default_rng(args.seed))
         self.cells = setting.grid.reachable
-        self.envs = make_vec(
-            args.problems * args.episodes,
-            autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
-            grid=setting.grid,
-            n_agents=setting.n_agents,
-            n_landmarks=setting.n_landmarks,
-            max_cycles=args.max_length,
-        )
+        self.envs = make_envs(setting, args.problems * args.episodes, args.max_length)
         self.envs.reset(seed=args.seed)  # each later problem is given, so nothing of it is random
         spec = self.spec
         self.lesson_states = Lessons.of(0, spec)  # of the episodes just played
@@ -165,9 +157,7 @@ class SelfImproved(Pupil):
     def play(self) -> None:
         """Play new problems, and keep of each the best episode."""
         args, k = self.args, self.spec.n_landmarks
-        drawn = self.rng.random((args.problems, len(self.cells))).argpartition(k - 1, axis=1)
-        # In the order that the environment gives them in.
-        landmarks = np.sort(self.cells[drawn[:, :k]], axis=1)
+        landmarks = draw_problems(self.cells, k, args.problems, self.rng)
         again = self.again[: args.played_again]
         landmarks[: len(again)] = again
         observations, joint, lengths = self.episodes(np.repeat(landmarks, args.episodes, axis=0))
@@ -240,41 +230,11 @@ class SelfImproved(Pupil):
             playing &= ~terminated & (step + 1 < lengths[problem])
         return Lessons(seen, good)
 
-    def episodes(self, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Play an episode on each row of landmarks: every so-many-th greedily.
-
-        Returns
-        -------
-        observations, actions
-            (T, rows, D) float32 and (T, rows) int64, joint; zero after the end of an episode.
-        lengths
-            (rows,) steps until all was visited, ``max_length + 1`` if it was not.
-        """
-        args = self.args
-        seen, _ = self.envs.reset(options={"landmarks": landmarks})
-        n_rows = len(landmarks)
-        playing = np.arange(n_rows)
-        lengths = np.full(n_rows, args.max_length + 1)
-        observations, actions = [], []
-        for step in range(1, args.max_length + 1):
-            here = np.zeros_like(seen)
-            here[playing] = seen[playing]
-            with torch.inference_mode():
-                scores = self.network(torch.from_numpy(seen[playing])).numpy()
-            # The largest of logits and Gumbel noise is a draw from the policy.
-            chance = self.rng.standard_exponential(scores.shape, np.float32)
-            noise = -np.log(np.maximum(chance, np.finfo(np.float32).tiny))
-            noise[playing % args.episodes == 0] = 0.0
-            joint = np.zeros(n_rows, np.int64)
-            joint[playing] = (self.sharpness * scores + noise).argmax(axis=1)
-            observations.append(here)
-            actions.append(joint)
-            seen, _, terminated, _, _ = self.envs.step(self.split(joint))
-            lengths[playing[terminated[playing]]] = step
-            playing = playing[~terminated[playing]]
-            if not len(playing):
-                break
-        return np.stack(observations), np.stack(actions), lengths
+    def episodes(self, landmarks: np.ndarray) -> Episodes:
+        """Play an episode on each row of landmarks: every so-many-th greedily."""
+        greedy = np.arange(len(landmarks)) % self.args.episodes == 0
+        limit = self.args.max_length
+        return play(self.envs, self.network, landmarks, limit, self.sharpness, greedy, self.rng)
 
     def split(self, joint: np.ndarray) -> np.ndarray:
         """Return the agents' actions (B, N) of joint ones (B,)."""

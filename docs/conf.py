@@ -53,10 +53,14 @@ def link_to_playground(_app: Any, _page: str, source: list[str]) -> None:
 
 
 def copy_playground(app: Any, error: Exception | None) -> None:
-    """Copy the playground beside the pages, if it is there."""
-    folder = HERE / PLAYGROUND
-    if error is None and app.builder.format == "html" and folder.is_dir():
-        shutil.copytree(folder, Path(app.outdir) / PLAYGROUND, dirs_exist_ok=True)
+    """Copy the playground beside the pages, and let its links lead to them."""
+    if error is None and app.builder.format == "html" and (HERE / PLAYGROUND).is_dir():
+        target = Path(app.outdir) / PLAYGROUND
+        shutil.copytree(HERE / PLAYGROUND, target, dirs_exist_ok=True)
+        page = target / "index.html"
+        text = page.read_text(encoding="utf-8")
+        links = re.sub(r'(href="\.\./\w+)\.md', r"\1.html", text)
+        page.write_text(links, encoding="utf-8")
 
 
 def setup(app: Any) -> dict[str, bool]:

@@ -39,14 +39,9 @@ def build(docs: Path, site: Path) -> subprocess.CompletedProcess[str]:
 def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """A page for every document, a docstring for every public name, and all pictures."""
     docs, site = tmp_path / "docs", tmp_path / "site"
-    # A copy with a playground: where there is none yet, it is to be taken along all the same.
     shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("_build"))
     for name in ("examples", "README.md", "CHANGELOG.md"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
-    (docs / "playground").mkdir(exist_ok=True)
-    (docs / "playground" / "probe.js").write_text("0;\n", encoding="utf-8")
-    with (docs / "glossary.md").open("a", encoding="utf-8") as page:
-        page.write("\n[to play with](playground/probe.js)\n")
     done = build(docs, site)
     assert (done.returncode, done.stderr) == (0, "")
     for page in DOCS.glob("*.md"):
@@ -59,8 +54,13 @@ def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
         assert re.search(rf'id="mapp_env\.rendering\.(\w+\.)*{name}"', reference), name
     index = unescape((site / "index.html").read_text(encoding="utf-8"))
     assert f"mapp_env {mapp_env.__version__}" in index
-    assert (site / "playground" / "probe.js").read_text(encoding="utf-8") == "0;\n"
-    assert 'href="playground/probe.js"' in (site / "glossary.html").read_text(encoding="utf-8")
+    assert 'href="playground/index.html"' in (site / "playground.html").read_text(encoding="utf-8")
+    for file in (DOCS / "playground").iterdir():
+        assert (site / "playground" / file.name).is_file(), file.name
+    playground = (site / "playground" / "index.html").read_text(encoding="utf-8")
+    links = re.findall(r'href="\.\./([^"#]+)', playground)
+    assert links
+    assert all((site / link).is_file() for link in links), links
 
 
 def test_a_broken_link_is_an_error(tmp_path: Path) -> None:
