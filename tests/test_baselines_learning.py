@@ -151,6 +151,21 @@ def test_step_size_rises_and_falls():
     assert rates(**both) == [0.0025, 0.004, 0.0045, 0.004, 0.002]
 
 
+@pytest.mark.parametrize("decay", [0.0, 0.3])
+def test_weights_decay_with_the_step_size(decay):
+    """What no gradient reaches shrinks by the step size times the decay, and only so."""
+    learner = paper_learner(0, 1, batch_size=4, learning_rate=0.1, weight_decay=decay)
+    fill(learner)
+    scores = learner.network.layers[0]
+    with torch.no_grad():
+        scores.weight[0], scores.bias[0] = 0.0, -100.0  # a unit that is never on
+    last = learner.network.layers[2].weight
+    start = last[:, 0].detach().clone()
+    for _ in range(3):
+        learner.update(0.0)
+    torch.testing.assert_close(last[:, 0].detach(), start * (1 - 0.1 * decay) ** 3)
+
+
 def test_target_network_is_copied_or_follows():
     """It is a copy every so many updates, or moves by its rate towards the network at each."""
     learner = paper_learner(0, 1, batch_size=4, target_interval=3)
@@ -498,6 +513,8 @@ def test_training_leaves_the_global_generators_alone(preset):
         ("double", 1),
         ("dueling", "no"),
         ("prefetch", 0),
+        ("half_precision", "no"),
+        ("weight_decay", -0.1),
         ("code_units", 0),
         ("learning_rate_warmup", -1),
         ("reward_scale", 0.0),
