@@ -49,13 +49,13 @@ class Args:
 
     seed: int = 0
     """seed of problems, exploration and weights"""
-    steps: int = 8000
+    steps: int = 6000
     """steps played in the environment"""
     steps_per_batch: int = 40
     """steps played before the network is updated"""
     updates_per_batch: int = 30
     """updates after that"""
-    batch_size: int = 256
+    batch_size: int = 128
     """transitions an update learns from"""
     reward: Literal["manhattan", "geodesic", "step"] = "geodesic"
     """the team reward"""
@@ -67,7 +67,7 @@ class Args:
     """step size of Adam"""
     tau: float = 0.01
     """share of the way that the target network goes to the network at each update"""
-    hidden_units: int = 128
+    hidden_units: int = 64
     """rectifier units in a hidden layer"""
     explore: float = 0.1
     """share of random actions when half of the steps are played; it falls to this from 1"""
