@@ -1,19 +1,21 @@
 """BenchMARL: a Task for ``mapp_env``, and IQL, VDN or QMIX trained on it for about a minute.
 
-BenchMARL 1.5 needs TorchRL below 0.12, the other examples a newer one: it gets a virtual environment
-of its own, with the versions of ``constraints.txt`` for all else. Usage::
+BenchMARL 1.5 needs TorchRL below 0.12, the tests a newer one: it gets a virtual environment of its
+own, with the versions of ``constraints.txt`` for everything else. Usage::
 
     python3 -m venv .venv-benchmarl
-    .venv-benchmarl/bin/pip install -c constraints.txt -e . benchmarl==1.5.2 tyro
+    grep -vE "^(torchrl|tensordict)=" constraints.txt > .venv-benchmarl/constraints.txt
+    .venv-benchmarl/bin/pip install -c .venv-benchmarl/constraints.txt -e . benchmarl==1.5.2 tyro
     OMP_NUM_THREADS=1 .venv-benchmarl/bin/python examples/benchmarl_task.py --algorithm vdn
     OMP_NUM_THREADS=1 .venv-benchmarl/bin/python examples/benchmarl_task.py --algorithm iql
     .venv-benchmarl/bin/python examples/benchmarl_task.py --help
 
-(Installed were benchmarl 1.5.2, torchrl 0.11.1, tensordict 0.11.0, torchvision 0.28.0, torch 2.13.0.)
+This installed torchrl 0.11.1, tensordict 0.11.0, torchvision 0.28.0 and torch 2.13.0.
 
-IQL: each agent learns from the team's reward by itself; VDN: the sum of the agents' values is taught
-to be the team's; QMIX: a mixing network, monotonous in each agent's value and told the state, in
-place of the sum. The agents share one network in all three.
+IQL: each agent learns from the team's reward by itself; VDN: the sum of the agents' values is
+taught to be the team's; QMIX: a mixing network, monotonous in each agent's value and told the
+state, in place of the sum. The agents share one network in all three, BenchMARL's for sets: here of
+the landmarks that an agent sees.
 
 Output: the mean return of the training episodes every thousand steps; then the greedy policy before
 and after on unseen problems, beside their proven optimum.
@@ -33,11 +35,11 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
-from beside_optimum import Judgement, judge, unseen_landmarks
 from benchmarl.algorithms import IqlConfig, QmixConfig, VdnConfig
 from benchmarl.environments import Task, TaskClass
 from benchmarl.experiment import Callback, Experiment, ExperimentConfig
 from benchmarl.models import DeepsetsConfig
+from beside_optimum import Judgement, judge, unseen_landmarks
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.data import Composite

@@ -33,7 +33,7 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import PettingZooWrapper
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
-from torchrl.modules import EGreedyModule, MLP, QValueActor, VDNMixer
+from torchrl.modules import MLP, EGreedyModule, QValueActor, VDNMixer
 from torchrl.objectives import SoftUpdate
 from torchrl.objectives.multiagent import QMixerLoss
 
