@@ -274,7 +274,7 @@ def main(args: Args) -> None:
     before = judge_experiment(experiment, landmarks, **arguments)
     print(
         f"{args.algorithm}: {args.problems} unseen problems, greedy; {len(report.met)} problems "
-        f"met, {seconds:.0f} s"
+        f"met, {seconds:.0f} s of one core"
     )
     print(f"before: {before}")
     print(f"after:  {after}")
