@@ -242,7 +242,8 @@ def main(args: Args) -> None:
     after = judge_actor(actor, landmarks, args)
     actor.load_state_dict(untrained)
     before = judge_actor(actor, landmarks, args)
-    print(f"{args.problems} unseen problems, greedy; {len(met)} problems met, {seconds:.0f} s of one core")
+    print(f"{args.problems} unseen problems, greedy; {len(met)} problems met")
+    print(f"trained {seconds:.0f} s of one core")
     print(f"before: {before}")
     print(f"after:  {after}")
 
