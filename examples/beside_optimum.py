@@ -1,0 +1,107 @@
+"""Any trainer's policy on problems it has not met, each beside its proven optimum.
+
+Usage, here with random moves that do not bump::
+
+    python examples/beside_optimum.py --problems 200
+
+Other scripts of this folder import :func:`judge`. It plays all problems side by side, so that a
+network is asked once a step for all of them. Needs ``mapp_env`` alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mapp_env import mapp_v0, sample_problems
+from mapp_env.solvers import optimal_costs
+
+# Takes observations (P, N, ...) and action masks (P, N, A); returns actions (P, N).
+Acting = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class Judgement(NamedTuple):
+    """What a policy did on P problems."""
+
+    solved: float  # per cent
+    gap: float  # per cent: cover time over its optimum, mean of the solved problems; NaN if none
+    mean_return: float  # undiscounted, of all problems
+
+    def __str__(self) -> str:
+        return (
+            f"return {self.mean_return:.1f}, solved {self.solved:.1f} %, mean gap {self.gap:.1f} %"
+        )
+
+
+def unseen_landmarks(
+    n_problems: int, seen: Iterable[Sequence[int]] = (), seed: int = 0, **arguments: Any
+) -> np.ndarray:
+    """Draw distinct problems, none of them in `seen`: landmark cells, shape (n_problems, K).
+
+    `arguments` are those of ``parallel_env``.
+    """
+    task = mapp_v0.parallel_env(**arguments).task
+    return sample_problems(
+        task.grid, n_problems, n_landmarks=task.n_landmarks, seed=seed, exclude=list(seen)
+    )
+
+
+def judge(act: Acting, landmarks: np.ndarray, **arguments: Any) -> Judgement:
+    """Let a policy play each problem once.
+
+    Parameters
+    ----------
+    act
+        The policy.
+    landmarks
+        (P, K) landmark cells, a problem a row.
+    arguments
+        Those of ``parallel_env``: what the policy sees, and the reward that is counted.
+    """
+    envs = [mapp_v0.parallel_env(**arguments) for _ in landmarks]
+    seen = [
+        env.reset(seed=0, options={"landmarks": cells})
+        for env, cells in zip(envs, landmarks, strict=True)
+    ]
+    agents = envs[0].possible_agents
+    returns = np.zeros(len(envs))
+    cover_times = np.full(len(envs), np.inf)
+    playing = list(range(len(envs)))
+    while playing:
+        observations = np.stack([[seen[p][0][a] for a in agents] for p in playing])
+        masks = np.stack([[seen[p][1][a]["action_mask"] for a in agents] for p in playing])
+        for p, actions in zip(playing, act(observations, masks), strict=True):
+            moves = dict(zip(agents, actions.tolist(), strict=True))
+            observation, rewards, _, _, infos = envs[p].step(moves)
+            returns[p] += rewards[agents[0]]  # the team reward, the same for all agents
+            seen[p] = observation, infos
+            if not envs[p].agents:
+                cover_times[p] = infos[agents[0]]["metrics"]["cover_time"]
+        playing = [p for p in playing if envs[p].agents]
+    task = envs[0].task
+    optima = optimal_costs(task.grid, np.asarray(landmarks), task.n_agents, "cover_time")
+    solved = np.isfinite(cover_times)
+    gaps = cover_times[solved] / optima[solved] - 1
+    gap = 100 * float(gaps.mean()) if solved.any() else float("nan")
+    return Judgement(100 * float(solved.mean()), gap, float(returns.mean()))
+
+
+def main() -> None:
+    """Judge random moves."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--problems", type=int, default=200, help="how many (default 200)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the moves (default 0)")
+    arguments = parser.parse_args()
+    generator = np.random.default_rng(arguments.seed)
+
+    def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
+        return np.argmax(generator.random(masks.shape) * masks, axis=-1)
+
+    print("random moves:", judge(act, unseen_landmarks(arguments.problems)))
+
+
+if __name__ == "__main__":
+    main()
