@@ -25,7 +25,8 @@ import tyro
 
 from baselines import meta_dqn
 from baselines.checks import check_choice, check_count
-from baselines.studies import Trial, plan_trial, run_study
+from baselines.studies import run_study
+from baselines.trials import Trial, plan_trial
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),

@@ -29,7 +29,8 @@ import tyro
 from baselines import independent_dqn, meta_dqn
 from baselines.checks import check_count
 from baselines.options import Options
-from baselines.studies import Trial, interval, plan_trial, run_study
+from baselines.studies import Summary, interval, run_study
+from baselines.trials import Trial, plan_trial
 
 LEARNERS: dict[str, tuple[str, type[Options], tuple[str, ...]]] = {
     "meta": (meta_dqn.ALGORITHM, meta_dqn.Args, ()),
@@ -37,6 +38,7 @@ LEARNERS: dict[str, tuple[str, type[Options], tuple[str, ...]]] = {
     "shared": (independent_dqn.ALGORITHM, independent_dqn.Args, ("--share-parameters",)),
 }
 COLUMNS = ("preset", "learner")
+TABLE = "comparison"
 
 
 @dataclass
@@ -101,13 +103,18 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
         If an option is refused, or a training has failed.
     """
     trials = plan_trials(args, words)
-    code, summaries = run_study(trials, args.out / "comparison", COLUMNS, args.jobs)
+    code, summaries = run_study(trials, args.out / TABLE, COLUMNS, args.jobs)
     if code == 0:
-        # Only here, because drawing takes longer to import than everything before.
-        from baselines.figures import draw_comparison
-
-        print(draw_comparison(args.out, summaries, interval))
+        draw(args.out, summaries)
     return code
+
+
+def draw(out: Path, summaries: Sequence[Summary]) -> None:
+    """Draw the figure."""
+    # Only here, because drawing takes longer to import than everything before.
+    from baselines.figures import draw_comparison
+
+    print(draw_comparison(out, summaries, interval))
 
 
 if __name__ == "__main__":

@@ -56,6 +56,16 @@ SAVED = ("network alone", "network, guidance 1")
 # -- training ----------------------------------------------------------------------------------
 
 
+def training_problems(args: Options, grid: Grid) -> np.ndarray:
+    """Draw the problems of a training, from its seed: (P, K)."""
+    return sample_problems(
+        grid,
+        args.n_problems,
+        n_landmarks=args.n_landmarks,
+        seed=int(Streams.spawn(args.seed).problems.generate_state(1)[0]),
+    )
+
+
 def train(
     training: Training, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals
 ) -> None:
@@ -157,12 +167,7 @@ def run_experiment(
     # All that can be refused is refused before anything is written.
     if resumed is None:
         setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
-        problems = sample_problems(
-            setting.grid,
-            args.n_problems,
-            n_landmarks=args.n_landmarks,
-            seed=int(Streams.spawn(args.seed).problems.generate_state(1)[0]),
-        )
+        problems = training_problems(args, setting.grid)
     else:
         setting, rows = read_setting(resumed)
         problems = np.array(rows, np.int32)

@@ -5,12 +5,10 @@ goes on where it was stopped; adds up over the seeds. ``compare.py`` and ``ablat
 """
 
 import csv
-import dataclasses
 import io
 import math
 import os
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -18,151 +16,29 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from filelock import FileLock, Timeout
 from scipy import stats
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.options import Options, parse_options
 from baselines.runs import (
-    CONFIG_FILE,
-    LOCK_FILE,
     METRICS_FILE,
     TIMING_FILE,
     StopSignals,
     parse_json,
     read_bytes,
-    read_config,
     read_metrics,
     write_atomically,
 )
+from baselines.trials import EVALUATION_FILE, Trial
 
-EVALUATION_FILE = "evaluation.csv"  # a training writes it when it is through
 MAX_EVALUATION_BYTES = 1024 * 1024
 ROW = "network alone"
 RETURN_EPISODES = 100  # the last ones of a training, for its return
-OWN_ENTRIES = ("out", "resume", "seed", "preset", "share_parameters", "threads", "prefetch")
 N_RESAMPLES = 10_000
 CONFIDENCE = 0.95
 CUT = 0.25  # from each side: the interquartile mean
 
 
 # -- trainings ---------------------------------------------------------------------------------
-
-
-class Trial(NamedTuple):
-    """One training of a study."""
-
-    group: tuple[
-        str, ...
-    ]  # what is summed up over the seeds: its cells of the table's first columns
-    seed: int
-    folder: Path
-    algorithm: str
-    options: Options
-    words: tuple[str, ...]  # its options, as words of a command line
-
-    @property
-    def name(self) -> str:
-        """What it is called in messages."""
-        return self.folder.name
-
-    @property
-    def finished(self) -> bool:
-        """Whether it has been evaluated, the last thing that counts here."""
-        return (self.folder / EVALUATION_FILE).is_file()
-
-    @property
-    def command(self) -> list[str]:
-        """What starts it, or goes on with it."""
-        start = [sys.executable, "-m", f"baselines.{self.algorithm}"]
-        if (self.folder / CONFIG_FILE).exists():
-            return [*start, "--resume", str(self.folder)]
-        return [*start, *self.words, "--out", str(self.folder)]
-
-
-def plan_trial(
-    group: tuple[str, ...],
-    seed: int,
-    out: Path,
-    kind: tuple[str, type[Options]],
-    own: Sequence[str],
-    words: Sequence[str],
-) -> Trial:
-    """Return a training of a study.
-
-    Parameters
-    ----------
-    group, seed, out
-        What it is one of; its folder in `out` is named after them.
-    kind
-        Algorithm and options.
-    own
-        Words of the command line that make it what it is.
-    words
-        Further words, the same for all.
-
-    Raises
-    ------
-    ValueError
-        If an option is refused, or its folder holds a training with other options.
-    """
-    set_here = {*OWN_ENTRIES, *map(option_name, own)}
-    for word in words:
-        if word.startswith("--") and option_name(word) in set_here:
-            raise ValueError(f"{word}: set for each training by the study itself")
-    # With a process for each core a second thread gains nothing.
-    all_words = ("--seed", str(seed), "--no-prefetch", *own, *words)
-    options = parse_options(kind[1], "", all_words)
-    if not options.evaluation_problems:
-        raise ValueError("evaluation_problems must be at least 1 to compare, got 0")
-    name = "-".join("_".join(cell.split()) for cell in (*group, f"seed{seed}"))
-    trial = Trial(group, seed, out / name, kind[0], options, all_words)
-    check_folder(trial)
-    return trial
-
-
-def option_name(word: str) -> str:
-    """Return the name of the option that a word of a command line sets."""
-    return word.partition("=")[0].removeprefix("--").replace("-", "_").removeprefix("no_")
-
-
-def check_folder(trial: Trial) -> None:
-    """Refuse what was trained with other options; clear away what did not come to begin.
-
-    Raises
-    ------
-    ValueError
-        If the folder holds anything else.
-    """
-    folder = trial.folder
-    if not folder.is_dir():
-        return
-    if (folder / CONFIG_FILE).exists():
-        config = read_config(folder)
-        options = config.get("options")
-        # As JSON has it.
-        wanted = {**dataclasses.asdict(trial.options), "out": None, "resume": None}
-        found = {**options, "out": None, "resume": None} if isinstance(options, dict) else {}
-        differing = sorted(
-            name for name in wanted | found if wanted.get(name) != found.get(name, wanted)
-        )
-        if config.get("algorithm") != trial.algorithm or differing:
-            raise ValueError(
-                f"out: {folder} holds another training: {', '.join(differing) or 'algorithm'} "
-                "differ; use another folder"
-            )
-        return
-    try:
-        with FileLock(folder / LOCK_FILE, timeout=0):
-            for path in list(folder.iterdir()):
-                # Killed before its config was written.
-                own = path.name == METRICS_FILE or path.name.startswith(f".{CONFIG_FILE}.")
-                if own:
-                    path.unlink()
-                elif path.name != LOCK_FILE:
-                    raise ValueError(f"out: {folder} holds something else: {path.name}")
-    except Timeout:
-        raise ValueError(f"out: another training is writing into {folder}") from None
 
 
 def train_all(trials: Iterable[Trial], jobs: int, signals: StopSignals) -> list[str]:
@@ -193,7 +69,7 @@ def train_all(trials: Iterable[Trial], jobs: int, signals: StopSignals) -> list[
                     done += 1
                     progress.write(f"{done}/{len(trials)} {trial.name}")
                 elif signals.received is None:
-                    failures.append(f"{trial.name}: {last_line(log_of(trial))}")
+                    failures.append(f"{trial.name}: {last_line(trial.log)}")
                     progress.write(f"failed: {failures[-1]}")
             progress.n = sum(count_episodes(t) for t in trials)
             progress.set_postfix(finished=f"{done}/{len(trials)}")
@@ -211,7 +87,7 @@ def start(trial: Trial) -> subprocess.Popen[bytes]:
     root = str(Path(__file__).resolve().parents[1])
     paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    with log_of(trial).open("ab") as log:
+    with trial.log.open("ab") as log:
         return subprocess.Popen(
             trial.command,
             stdin=subprocess.DEVNULL,
@@ -222,11 +98,6 @@ def start(trial: Trial) -> subprocess.Popen[bytes]:
             # checkpoint short.
             start_new_session=True,
         )
-
-
-def log_of(trial: Trial) -> Path:
-    """Return where a training's output goes."""
-    return trial.folder.with_name(trial.folder.name + ".log")
 
 
 def last_line(path: Path) -> str:
@@ -409,10 +280,7 @@ def run_study(
     ValueError
         If the folder cannot be written into, or a training has failed.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"out: cannot write into {path.parent}: {error}") from error
+    make_folder(path.parent)
     signals = StopSignals()
     with signals:
         failures = train_all(trials, jobs, signals)
@@ -421,7 +289,32 @@ def run_study(
         return 128 + signals.received, []
     if failures:
         raise ValueError("these trainings failed: " + "; ".join(failures))
+    return 0, gather(trials, path, columns)
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a study.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"out: cannot write into {folder}: {error}") from error
+
+
+def gather(trials: Sequence[Trial], path: Path, columns: Sequence[str]) -> list[Summary]:
+    """Add up what came out of finished trainings, write and print the tables.
+
+    Raises
+    ------
+    ValueError
+        If a file of a training cannot be read.
+    """
     summaries = summarise([read_outcome(trial) for trial in trials])
     save_study(path, columns, summaries)
     print(f"\n{format_study(columns, summaries)}\n")
-    return 0, summaries
+    return summaries

@@ -1,0 +1,171 @@
+"""Run compare.py's grid of presets, learners and seeds as Ray tasks, on one machine or on many.
+
+    pip install -c constraints.txt -e ".[baselines,ray]"
+    python examples/ray_seeds.py --out runs/compare --seeds 5
+    python examples/ray_seeds.py --address auto --out /shared/compare --seeds 5
+
+Every training is a Ray task with one core, in a process of its own. A worker that is lost (killed,
+out of memory, its machine gone) is started again by Ray, up to ``--max-retries`` times, and its
+training goes on from the last checkpoint in its run folder, to the same bytes as if nothing had
+been. So OUT has to be a folder that all machines see under the same path, and this checkout too.
+
+Output: OUT/comparison.md, .csv and .png as ``python baselines/compare.py`` writes them, equal but
+for the minutes, and the run folder and log of each training. The same command, or compare.py's,
+goes on where this one was stopped. Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings,
+each with a checkpoint.
+
+Without ``--address`` Ray is started here, on ``--jobs`` cores, and stopped at the end.
+"""
+
+import contextlib
+import importlib
+import os
+import socket
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+
+import ray
+import tyro
+
+from baselines import compare
+from baselines.checks import check_count
+from baselines.options import parse_options
+from baselines.runs import StopSignals
+from baselines.studies import gather, last_line, make_folder
+from baselines.trials import Trial, check_folder
+
+ROOT = Path(__file__).resolve().parents[1]
+OBJECT_STORE_BYTES = 200_000_000  # a task returns one number
+
+
+@dataclass
+class Args(compare.Args):
+    """Options of a comparison, and where it runs; all others are handed to the trainings."""
+
+    address: str | None = None
+    """of a Ray cluster ("auto": the one this machine belongs to); its cores are all used, whatever
+    jobs is; by default Ray is started here"""
+    max_retries: int = 3
+    """how often a training is taken up again whose worker was lost"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("max_retries", self.max_retries, 0, 1000)
+
+
+def train(trial: Trial) -> int:
+    """Train in this process, or go on with what a lost one has left; return the exit code.
+
+    Raises
+    ------
+    ValueError
+        If the run folder holds anything else, or another process still trains in it.
+    """
+    check_folder(trial)
+    if trial.finished:
+        return 0
+    # A line at a time: of a process that is killed nothing else is left.
+    with (
+        trial.log.open("a", buffering=1, encoding="utf-8") as log,
+        contextlib.redirect_stdout(log),
+        contextlib.redirect_stderr(log),
+    ):
+        print(f"process {os.getpid()} on {socket.gethostname()}")
+        learner = importlib.import_module(f"baselines.{trial.algorithm}")
+        code: int = learner.main(parse_options(type(trial.options), "", trial.arguments))
+    return code
+
+
+def start_ray(args: Args) -> None:
+    """Connect to the cluster, or start Ray here."""
+    here = {
+        "num_cpus": args.jobs,
+        "object_store_memory": OBJECT_STORE_BYTES,
+        "include_dashboard": False,
+    }
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    ray.init(
+        args.address or "local",
+        log_to_driver=False,
+        runtime_env={"env_vars": variables},
+        **(here if args.address is None else {}),
+    )
+
+
+def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -> list[str]:
+    """Train what is not finished as Ray tasks; return what went wrong, a line for each."""
+    waiting = [trial for trial in trials if not trial.finished]
+    done = len(trials) - len(waiting)
+    if done:
+        print(f"{done} of {len(trials)} trainings were finished already")
+    # One call a process: nothing is left over from the training before.
+    task = ray.remote(num_cpus=1, max_calls=1, max_retries=max_retries)(train)
+    running = {task.remote(trial): trial for trial in waiting}
+    failures: list[str] = []
+    told = False
+    while running:
+        if signals.received is not None and not told:
+            told = True
+            for reference in running:
+                ray.cancel(reference)  # as Ctrl-C: the training saves a checkpoint and returns
+        for reference in ray.wait(list(running), timeout=0.5)[0]:
+            trial = running.pop(reference)
+            problem = describe_failure(reference, trial)
+            if problem is None:
+                done += 1
+                print(f"{done}/{len(trials)} {trial.name}", flush=True)
+            elif not told:
+                failures.append(f"{trial.name}: {problem}")
+                print(f"failed: {failures[-1]}", flush=True)
+    return failures
+
+
+def describe_failure(reference: "ray.ObjectRef[int]", trial: Trial) -> str | None:
+    """Return what went wrong with a task that has ended, None if nothing."""
+    try:
+        code = ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        return str(error.cause)
+    except ray.exceptions.RayError as error:  # lost once too often, or cancelled
+        return str(error).strip().splitlines()[0]
+    return None if code == 0 and trial.finished else last_line(trial.log)
+
+
+def main(args: Args, words: Sequence[str] = ()) -> int:
+    """Train, compare, draw; return the exit code.
+
+    Raises
+    ------
+    ValueError
+        If an option is refused, or a training has failed.
+    """
+    args.out = args.out.resolve()
+    trials = compare.plan_trials(args, words)
+    make_folder(args.out)
+    signals = StopSignals()
+    start_ray(args)
+    try:
+        with signals:
+            failures = train_all(trials, args.max_retries, signals)
+    finally:
+        ray.shutdown()
+    if signals.received is not None:
+        print("stopped early; the same command goes on", flush=True)
+        return 128 + signals.received
+    if failures:
+        raise ValueError("these trainings failed: " + "; ".join(failures))
+    compare.draw(args.out, gather(trials, args.out / compare.TABLE, compare.COLUMNS))
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        own, others = tyro.cli(Args, description=__doc__, return_unknown_args=True)
+        sys.exit(main(own, others))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from error

@@ -1,0 +1,117 @@
+"""A study run as Ray tasks is the serial one, also if a worker is killed in the middle of it."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from baselines import compare
+from baselines.studies import MEASURES
+
+pytest.importorskip("ray")
+
+SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "ray_seeds.py"
+GRID = {"presets": ("default", "paper"), "learners": ("meta",), "seeds": 1, "default_updates": 4}
+WORDS = [
+    *("--n-problems", "2", "--episodes-per-problem", "8", "--max-cycles", "12"),
+    *("--n-landmarks", "2", "--learning-starts", "10", "--update-interval", "5"),
+    *("--batch-size", "8", "--hidden-units", "8", "--evaluation-problems", "40"),
+    *("--checkpoint-seconds", "0.02"),
+]
+SAME = ("metrics.csv", "policy.safetensors", "evaluation.csv")
+
+
+def start(out: Path, home: Path, *words: str) -> "subprocess.Popen[str]":
+    """Start the study with Ray."""
+    command = [sys.executable, str(SCRIPT), "--out", str(out), "--jobs", "2", *words, *WORDS]
+    for name, value in GRID.items():
+        values = value if isinstance(value, tuple) else (str(value),)
+        command += [f"--{name.replace('_', '-')}", *values]
+    # Ray keeps a token in the home folder.
+    environment = {**os.environ, "HOME": str(home), "RAY_USAGE_STATS_ENABLED": "0"}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def process_in_the_middle(run: Path, deadline: float = 120.0) -> int:
+    """Wait until a training has saved twice and is not through; return the process it runs in."""
+    end = time.monotonic() + deadline
+    while time.monotonic() < end:
+        if len(list((run / "checkpoints").glob("*.json"))) == 2:
+            assert not (run / "evaluation.csv").exists()
+            log = run.with_name(run.name + ".log").read_text()
+            return int(log.removeprefix("process ").split()[0])
+        time.sleep(0.005)
+    raise AssertionError(f"{run}: no second checkpoint in {deadline} seconds")
+
+
+def untimed_csv(path: Path) -> list[dict[str, str]]:
+    """Return the table of all digits without its minutes, exactly as written."""
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    assert any("minutes" in name for name in rows[0])
+    return [{k: v for k, v in row.items() if not k.startswith("minutes ")} for row in rows]
+
+
+def untimed_table(path: Path) -> list[str]:
+    """Return the lines of the printed table without their last column, the minutes."""
+    assert list(MEASURES)[-1] == "minutes"
+    return [line.rsplit("|", 2)[0] for line in path.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory):
+    """Return the folder of the comparison that compare.py makes."""
+    out = tmp_path_factory.mktemp("serial") / "study"
+    assert compare.main(compare.Args(out=out, jobs=1, **GRID), WORDS) == 0
+    return out
+
+
+def test_killed_worker_changes_nothing(serial, tmp_path):
+    """After kill -9 of a worker in mid-training, weights and tables are those of compare.py."""
+    out = tmp_path / "study"
+    study = start(out, tmp_path)
+    os.kill(process_in_the_middle(out / "default-meta-seed0"), signal.SIGKILL)
+    printed, _ = study.communicate(timeout=240)
+    assert study.returncode == 0, printed
+    log = (out / "default-meta-seed0.log").read_text()
+    assert log.count("process ") == 2
+    assert "going on from episode" in log
+    for run in ("default-meta-seed0", "paper-meta-seed0"):
+        for name in SAME:
+            assert (out / run / name).read_bytes() == (serial / run / name).read_bytes()
+    assert untimed_csv(out / "comparison.csv") == untimed_csv(serial / "comparison.csv")
+    assert untimed_table(out / "comparison.md") == untimed_table(serial / "comparison.md")
+    assert (out / "comparison.png").stat().st_size > 10_000
+
+
+def test_a_signal_stops_the_tasks_with_a_checkpoint(serial, tmp_path):
+    """SIGTERM ends the study with 143; compare.py goes on with what it left, to the same table."""
+    out = tmp_path / "study"
+    study = start(out, tmp_path)
+    process_in_the_middle(out / "default-meta-seed0")
+    study.send_signal(signal.SIGTERM)
+    printed, _ = study.communicate(timeout=120)
+    assert study.returncode == 128 + signal.SIGTERM, printed
+    assert "the same command goes on" in printed
+    assert "stopped early" in (out / "default-meta-seed0.log").read_text()
+    assert compare.main(compare.Args(out=out, jobs=1, **GRID), WORDS) == 0
+    assert "going on from episode" in (out / "default-meta-seed0.log").read_text()
+    assert untimed_csv(out / "comparison.csv") == untimed_csv(serial / "comparison.csv")
+
+
+def test_what_is_lost_too_often_is_reported(tmp_path):
+    """With no retry allowed, a killed worker ends the study with an error that names it."""
+    out = tmp_path / "study"
+    study = start(out, tmp_path, "--max-retries", "0")
+    os.kill(process_in_the_middle(out / "default-meta-seed0"), signal.SIGKILL)
+    printed, _ = study.communicate(timeout=240)
+    assert study.returncode == 1
+    assert "error: these trainings failed: default-meta-seed0: " in printed
+    assert not (out / "comparison.md").exists()
