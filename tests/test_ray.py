@@ -14,6 +14,8 @@ from baselines import compare
 from baselines.studies import MEASURES
 
 pytest.importorskip("ray")
+# Each starts a Ray of its own: `python -m pytest -m slow tests/test_ray.py`.
+pytestmark = pytest.mark.slow
 
 SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "ray_seeds.py"
 GRID = {"presets": ("default", "paper"), "learners": ("meta",), "seeds": 1, "default_updates": 4}
