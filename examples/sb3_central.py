@@ -18,7 +18,7 @@ import tyro
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 
-import mapp_env  # registers mapp_env/Central-v0
+import mapp_env  # noqa: F401 - registers mapp_env/Central-v0
 from baselines.other_trainers import report
 from mapp_env.adapters.sb3_returns import EpisodeReturns
 

@@ -1,8 +1,8 @@
 """SuperSuit and Stable-Baselines3: PPO, one network that every agent uses by itself.
 
-`make_sb3_shared` puts the view of `mapp_env.adapters.sb3_shared` over SuperSuit's batch of agents, so
-that seeds and time-outs arrive. Agents start on one cell: `observation="geodesic"` tells each for
-which landmarks it is the nearest. What it reached is in docs/trainers.md.
+`make_sb3_shared` puts the view of `mapp_env.adapters.sb3_shared` over SuperSuit's batch of agents,
+so that seeds and time-outs arrive. Agents start on one cell: `observation="geodesic"` tells each
+for which landmarks it is the nearest. What it reached is in docs/trainers.md.
 
     python examples/sb3_shared.py             # a minute of CPU time; --help for more
 

@@ -1,8 +1,8 @@
 """Tianshou 2: three independent double DQNs on the AEC form, each agent its own network.
 
-Tianshou takes PettingZoo's AEC form, `mapp_v0.env()`, in which agents act in turns, and stores their
-turns one after the other. So an agent's next turn is three turns on: with a three-step return each
-agent learns from what it saw itself. What it reached is in docs/trainers.md.
+Tianshou takes PettingZoo's AEC form, `mapp_v0.env()`, in which agents act in turns, and stores
+their turns one after the other. So an agent's next turn is three turns on: with a three-step return
+each agent learns from what it saw itself. What it reached is in docs/trainers.md.
 
     python examples/tianshou_dqn.py                # a minute of CPU time; --help for more
 

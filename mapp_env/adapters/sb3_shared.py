@@ -73,9 +73,11 @@ class SharedVecEnv(VecEnv):
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every environment; return the observations, shape (B, ...)."""
-        observations, infos = self.venv.reset(seed=self._seed)
+        # SuperSuit gives infos as a list, where Gymnasium has a dict of arrays.
+        found: Any
+        observations, found = self.venv.reset(seed=self._seed)
         self._seed = None
-        self.reset_infos = list(infos)
+        self.reset_infos = list(found)
         return np.array(observations)
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
@@ -93,6 +95,7 @@ class SharedVecEnv(VecEnv):
             Shapes (B, ...), (B,) float32, (B,) bool, and a list of length B. As SuperSuit leaves
             it, the ``action_mask`` of an ended row's info is that of its next episode.
         """
+        found: Any
         observations, rewards, terminations, truncations, found = self.venv.step(self._actions)
         terminations, truncations = terminations.astype(bool), truncations.astype(bool)
         infos: list[dict[str, Any]] = [

@@ -106,9 +106,7 @@ class TupleEnv(gymnasium.Env[Views, Any]):
         views, self.action_masks = self._simulation.observe()
         return tuple(views), {}
 
-    def step(
-        self, action: Sequence[int]
-    ) -> tuple[Views, list[float], bool, bool, dict[str, Any]]:  # type: ignore[override]
+    def step(self, action: Sequence[int]) -> tuple[Views, list[float], bool, bool, dict[str, Any]]:  # type: ignore[override]
         """Move all agents at the same instant.
 
         Parameters
