@@ -47,12 +47,25 @@ class Args:
     """number of problems to evaluate on, greedily"""
     seed: int = 0
     """seed of networks, exploration and problems"""
-    num_envs: int = 32
+    num_envs: int = 64
     """environments that are played side by side"""
     learning_rate: float = 1e-3
     """of Adam"""
+    reward_scale: float = 0.05
+    """what rewards are multiplied with: a step's may be -30"""
     discount: float = 0.9
     """of a step of the team"""
+
+
+class ScaledEnv(PettingZooEnv):
+    """Tianshou's view of the environment, with smaller rewards."""
+
+    scale = 1.0
+
+    def step(self, action: int) -> tuple[dict, list[float], bool, bool, dict]:
+        """Take an agent's turn; return what the next one sees, and everyone's reward."""
+        observation, rewards, terminated, truncated, info = super().step(action)
+        return observation, [self.scale * r for r in rewards], terminated, truncated, info
 
 
 def make_learner(env: PettingZooEnv, args: Args) -> DQN:
@@ -74,7 +87,7 @@ def make_learner(env: PettingZooEnv, args: Args) -> DQN:
         gamma=args.discount ** (1 / n_agents),  # of one agent's turn
         n_step_return_horizon=n_agents,
         target_update_freq=200,
-        huber_loss_delta=10.0,
+        huber_loss_delta=1.0,
     )
 
 
@@ -87,7 +100,9 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
 
     def make_env() -> PettingZooEnv:
-        return PettingZooEnv(mapp_v0.env(observation="geodesic"))
+        env = ScaledEnv(mapp_v0.env(observation="geodesic"))
+        env.scale = args.reward_scale
+        return env
 
     env = make_env()
     learners = [make_learner(env, args) for _ in env.agents]
@@ -98,12 +113,12 @@ def main(args: Args) -> None:
     returns: list[float] = []
 
     def keep_return(episode: object) -> None:
-        returns.append(float(episode.rew[:, 0].sum()))  # type: ignore[attr-defined]
+        returns.append(float(episode.rew[:, 0].sum() / args.reward_scale))  # type: ignore[attr-defined]
 
     collector = Collector[CollectStats](
         algorithm,
         envs,
-        VectorReplayBuffer(120_000, args.num_envs),
+        VectorReplayBuffer(60_000, args.num_envs),
         exploration_noise=True,
         on_episode_done_hook=keep_return,
         raise_on_nan_in_buffer=False,  # it would look through the whole buffer at each step
@@ -114,7 +129,7 @@ def main(args: Args) -> None:
             training_collector=collector,
             max_epochs=1_000_000,
             epoch_num_steps=48 * args.num_envs,
-            collection_step_num_env_steps=48 * args.num_envs,
+            collection_step_num_env_steps=24 * args.num_envs,
             update_step_num_gradient_steps_per_sample=1 / 64,
             batch_size=384,
             multi_agent_return_reduction=lambda rewards: rewards[:, 0],
