@@ -48,6 +48,12 @@ def _register() -> None:
             entry_point="mapp_env.central_env:CentralEnv",
             vector_entry_point="mapp_env.vector_env:make_gymnasium_vec",
         )
+    if "mapp_env/Tuple-v0" not in gymnasium.registry:
+        gymnasium.register(
+            "mapp_env/Tuple-v0",
+            entry_point="mapp_env.adapters.tuple_env:TupleEnv",
+            disable_env_checker=True,  # it would warn that a list of rewards is no number
+        )
     # PettingZoo has a registry from 1.27 on.
     if hasattr(pettingzoo, "register"):
         for kind, registry, entry_point in (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
 
-__all__ = ["RowSeeds"]
+__all__ = ["RowSeeds", "spread_seed"]
 
 WORDS_AHEAD = 64
 """Words fetched from a row's generator at a time: a call for each would dominate a step."""
@@ -81,9 +81,9 @@ class RowSeeds:
             self.generators = [np.random.default_rng(0)] * self.n_rows
             self.seeds = [0] * self.n_rows
             spread = seed if isinstance(seed, int) else None
-            self._set(_spread(spread, self.n_rows), list(range(self.n_rows)))
+            self._set(spread_seed(spread, self.n_rows), list(range(self.n_rows)))
         elif isinstance(seed, int):
-            self._set(_spread(seed, self.n_rows), indices)
+            self._set(spread_seed(seed, self.n_rows), indices)
         if isinstance(seed, list):
             self._set(seed, [index for index in indices if seed[index] is not None])
 
@@ -104,7 +104,7 @@ class RowSeeds:
         return words
 
 
-def _spread(seed: int | None, count: int) -> list[int]:
+def spread_seed(seed: int | None, count: int) -> list[int]:
     """Return ``count`` independent seeds that depend on ``seed`` and their place alone."""
     words: list[int] = np.random.SeedSequence(seed).generate_state(count, np.uint64).tolist()
     return words

@@ -1,0 +1,84 @@
+"""Stable-Baselines3 on `mapp_env/Central-v0`: DQN over the 64 joint actions of three agents.
+
+One network sees each agent's shortest paths to the landmarks (`observation="geodesic"`) and values
+every joint action. What it reached is in docs/trainers.md.
+
+    python examples/sb3_central.py            # a minute of CPU time; --help for more
+
+Needs `pip install -c constraints.txt -e ".[baselines,sb3]"`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import tyro
+from stable_baselines3 import DQN
+from stable_baselines3.common.env_util import make_vec_env
+
+import mapp_env  # noqa: F401 - registers mapp_env/Central-v0
+from baselines.other_trainers import report
+from mapp_env.adapters.sb3_returns import EpisodeReturns
+
+
+@dataclass
+class Args:
+    """Options of the training."""
+
+    seconds: float = 60.0
+    """CPU seconds to train for"""
+    steps: int = 120_000
+    """most steps to train for; exploration falls over them"""
+    problems: int = 1000
+    """number of problems to evaluate on, greedily"""
+    seed: int = 0
+    """seed of network, exploration and problems"""
+    num_envs: int = 16
+    """environments that are played side by side"""
+    learning_rate: float = 1e-3
+    """of Adam"""
+    discount: float = 0.9
+    """of a step"""
+
+
+def main(args: Args) -> None:
+    """Train and print what was reached."""
+    torch.set_num_threads(1)
+    envs = make_vec_env(
+        "mapp_env/Central-v0",
+        n_envs=args.num_envs,
+        seed=args.seed,
+        env_kwargs={"observation": "geodesic"},
+    )
+    model = DQN(
+        "MlpPolicy",
+        envs,
+        buffer_size=200_000,
+        learning_starts=2_000,
+        batch_size=256,
+        train_freq=4,
+        gradient_steps=8,
+        target_update_interval=2_000,
+        exploration_fraction=1.0,
+        exploration_initial_eps=0.5,
+        exploration_final_eps=0.05,
+        gamma=args.discount,
+        learning_rate=args.learning_rate,
+        policy_kwargs={"net_arch": [256, 256]},
+        seed=args.seed,
+        device="cpu",
+    )
+    watch = EpisodeReturns(args.seconds)
+    model.learn(args.steps, callback=watch)
+
+    def act(observations: np.ndarray) -> np.ndarray:
+        numbers = model.predict(observations, deterministic=True)[0]
+        return np.stack(np.unravel_index(numbers, (4, 4, 4)), axis=1)  # the first agent leads
+
+    report("sb3_central.py", watch.elapsed, watch.returns, act, "geodesic", args.problems)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

@@ -1,0 +1,77 @@
+"""SuperSuit and Stable-Baselines3: PPO, one network that every agent uses by itself.
+
+`make_sb3_shared` puts the view of `mapp_env.adapters.sb3_shared` over SuperSuit's batch of agents,
+so that seeds and time-outs arrive. Agents start on one cell: `observation="geodesic"` tells each
+for which landmarks it is the nearest. What it reached is in docs/trainers.md.
+
+    python examples/sb3_shared.py             # a minute of CPU time; --help for more
+
+Needs `pip install -c constraints.txt -e ".[baselines,sb3]"`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import tyro
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from baselines.other_trainers import report
+from mapp_env.adapters.sb3_returns import EpisodeReturns
+from mapp_env.adapters.sb3_shared import make_sb3_shared
+
+
+@dataclass
+class Args:
+    """Options of the training."""
+
+    seconds: float = 60.0
+    """CPU seconds to train for"""
+    problems: int = 1000
+    """number of problems to evaluate on, greedily"""
+    seed: int = 0
+    """seed of network, exploration and problems"""
+    num_envs: int = 16
+    """environments; the network commands three rows of each"""
+    learning_rate: float = 1e-3
+    """of Adam"""
+    discount: float = 0.95
+    """of a step"""
+
+
+def main(args: Args) -> None:
+    """Train and print what was reached."""
+    torch.set_num_threads(1)
+    envs = make_sb3_shared(args.num_envs, observation="geodesic")
+    model = PPO(
+        "MlpPolicy",
+        # Returns run into the hundreds: scaled, or the critic's loss drowns the actor's.
+        VecNormalize(VecMonitor(envs), norm_obs=False, gamma=args.discount),
+        n_steps=64,
+        batch_size=768,
+        n_epochs=4,
+        gamma=args.discount,
+        gae_lambda=0.9,
+        ent_coef=0.003,
+        learning_rate=args.learning_rate,
+        policy_kwargs={"net_arch": [64, 64]},
+        seed=args.seed,
+        device="cpu",
+    )
+    watch = EpisodeReturns(args.seconds)
+    model.learn(10**9, callback=watch)
+
+    def act(observations: np.ndarray) -> np.ndarray:
+        rows = observations.reshape(-1, observations.shape[-1])
+        return model.predict(rows, deterministic=True)[0].reshape(observations.shape[:2])
+
+    # The agents of a team end together, with the same return.
+    returns = watch.returns[:: envs.n_agents]
+    report("sb3_shared.py", watch.elapsed, returns, act, "geodesic", args.problems)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

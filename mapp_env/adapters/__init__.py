@@ -1,0 +1,9 @@
+"""What trainers of other projects need and do not bring; docs/trainers.md shows each in use.
+
+Importing this package loads no trainer. Each of its modules loads the one that it is for:
+
+- :mod:`mapp_env.adapters.sb3_vec`: the batched engine as a Stable-Baselines3 ``VecEnv``;
+- :mod:`mapp_env.adapters.sb3_shared`: agents that share parameters, SuperSuit under
+  Stable-Baselines3;
+- :mod:`mapp_env.adapters.tuple_env`: ``mapp_env/Tuple-v0`` for trainers in EPyMARL's manner.
+"""

@@ -1,0 +1,262 @@
+"""The batched engine as a Stable-Baselines3 ``VecEnv``: no copy of rows, no environment a row."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from mapp_env.row_seeds import spread_seed
+from mapp_env.validation import MAX_SEED, check_count, describe
+from mapp_env.vector_env import MappVectorEnv
+
+__all__ = ["MappSb3VecEnv", "make_sb3_vec"]
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+"""The info of a row whose episode goes on. One for all: a dict a row would take half a step."""
+
+
+class MappSb3VecEnv(VecEnv):
+    """Many problems for one meta-agent, stepped as one batch, as Stable-Baselines3 wants them.
+
+    A row that ends starts its next episode in the same step. Its info holds
+
+    - ``terminal_observation``: what was seen last;
+    - ``TimeLimit.truncated``: whether the step limit ended it, so that its value is bootstrapped;
+    - ``metrics``: success, cover_time, makespan and total_distance;
+    - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them.
+
+    Infos of the other rows are empty and read-only.
+
+    Parameters
+    ----------
+    num_envs : int
+        Number of rows B, 1 to 1,048,576.
+    **arguments
+        Those of :class:`mapp_env.vector_env.MappVectorEnv` but ``autoreset_mode``:
+        ``central_action="multi"`` (the default) gives ``MultiDiscrete`` actions, ``"joint"``
+        numbered ones, which DQN needs.
+
+    Attributes
+    ----------
+    engine : MappVectorEnv
+        What is stepped.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as said.
+    """
+
+    def __init__(self, num_envs: int, **arguments: Any) -> None:
+        if "autoreset_mode" in arguments:
+            raise ValueError(
+                "autoreset_mode cannot be chosen: Stable-Baselines3 needs the same-step mode; "
+                f"got {describe(arguments['autoreset_mode'])}"
+            )
+        self.engine = MappVectorEnv(num_envs, autoreset_mode="SameStep", **arguments)
+        self._seed: int | None = None
+        self._wishes: dict[str, Any] = {}
+        self._actions: Any = None
+        self._returns = np.zeros(self.engine.num_envs)
+        self._lengths = np.zeros(self.engine.num_envs, np.int64)
+        self._started = time.perf_counter()
+        super().__init__(
+            self.engine.num_envs,
+            self.engine.single_observation_space,
+            self.engine.single_action_space,
+        )
+
+    # -- episodes ----------------------------------------------------------------------
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the next :meth:`reset`; the rows' seeds are spread as the engine spreads them.
+
+        Returns
+        -------
+        list of int, length B
+            A single environment that is reset with the row's seed is that row.
+
+        Raises
+        ------
+        ValueError
+            If it is no seed.
+        """
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        self._seed = check_count("seed", seed, 0, MAX_SEED)
+        return spread_seed(self._seed, self.num_envs)
+
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Set the options of the next :meth:`reset`, as the engine takes them.
+
+        Parameters
+        ----------
+        options : dict, optional
+            ``"landmarks"`` or ``"problem"`` for all rows alike, or the landmarks of each row as
+            cells, shape (B, K).
+
+        Raises
+        ------
+        ValueError
+            If it is a list: the engine takes one dict for all rows.
+        """
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(
+                "options must be one dict for all rows (landmarks may have shape (B, K)), "
+                f"got {describe(options)}"
+            )
+        self._wishes = dict(options or {})
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start an episode in every row; return the observations, shape (B, ...).
+
+        Raises
+        ------
+        ValueError
+            If the options cannot be used.
+        """
+        observations, _ = self.engine.reset(seed=self._seed, options=self._wishes)
+        self._seed, self._wishes = None, {}
+        self._returns[:] = 0.0
+        self._lengths[:] = 0
+        return observations
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Keep the actions, shape (B, N) or (B,), for :meth:`step_wait`."""
+        self._actions = actions
+
+    def step_wait(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """Carry out the joint actions.
+
+        Returns
+        -------
+        observations, rewards, dones, infos
+            Shapes (B, ...), (B,) float32, (B,) bool, and a list of length B.
+
+        Raises
+        ------
+        ValueError
+            If an action is not valid; nothing has moved then.
+        """
+        observations, rewards, terminations, truncations, found = self.engine.step(self._actions)
+        dones = terminations | truncations
+        self._returns += rewards
+        self._lengths += 1
+        infos: list[Any] = [NOTHING] * self.num_envs
+        ended = np.flatnonzero(dones)
+        if len(ended):
+            last = self._last_infos(ended, truncations, found)
+            for index, info in zip(ended.tolist(), last, strict=True):
+                infos[index] = info
+            self._returns[ended] = 0.0
+            self._lengths[ended] = 0
+        return observations, rewards.astype(np.float32), dones, infos
+
+    def _last_infos(
+        self, ended: NDArray[np.int64], truncations: NDArray[np.bool_], found: dict[str, Any]
+    ) -> list[dict[str, Any]]:
+        """Return the infos of the rows that have ended."""
+        seconds = round(time.perf_counter() - self._started, 6)
+        metrics = found["final_info"]["metrics"]
+        # Columns as lists and dicts written out: this is most of what the adapter costs.
+        columns = [
+            metrics["success"],
+            metrics["cover_time"],
+            metrics["makespan"],
+            metrics["total_distance"],
+            found["final_obs"],
+            truncations,
+            self._returns,
+            self._lengths,
+        ]
+        return [
+            {
+                "terminal_observation": observation,
+                "TimeLimit.truncated": truncated,
+                "metrics": {
+                    "success": success,
+                    "cover_time": cover_time,
+                    "makespan": makespan,
+                    "total_distance": distance,
+                },
+                "episode": {"r": total, "l": length, "t": seconds},
+            }
+            for (
+                success,
+                cover_time,
+                makespan,
+                distance,
+                observation,
+                truncated,
+                total,
+                length,
+            ) in zip(*(column[ended].tolist() for column in columns), strict=True)
+        ]
+
+    # -- what else a VecEnv has --------------------------------------------------------
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """Return the engine's attribute once for each row asked for."""
+        return [getattr(self.engine, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Refuse: rows have no attributes of their own.
+
+        Raises
+        ------
+        ValueError
+            Always.
+        """
+        raise ValueError(f"{attr_name} cannot be set: rows of the engine have no attributes")
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Refuse: rows have no methods of their own.
+
+        Raises
+        ------
+        ValueError
+            Always.
+        """
+        raise ValueError(f"{method_name}() cannot be called by row: call it on .engine")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Return that no row is wrapped in anything."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return a picture of each row, with ``render_mode="rgb_array"``."""
+        pictures = self.engine.render()
+        return [None] * self.num_envs if pictures is None else pictures
+
+    def close(self) -> None:
+        """Close the engine; may be called again."""
+        self.engine.close()
+
+
+def make_sb3_vec(num_envs: int, **arguments: Any) -> MappSb3VecEnv:
+    """Return ``num_envs`` problems stepped as one batch, as a Stable-Baselines3 ``VecEnv``.
+
+    Parameters are those of :class:`MappSb3VecEnv`.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as said.
+
+    Examples
+    --------
+    >>> from stable_baselines3 import PPO
+    >>> from mapp_env.adapters.sb3_vec import make_sb3_vec
+    >>> model = PPO("MlpPolicy", make_sb3_vec(256), n_steps=64, batch_size=2048, seed=0)
+    """
+    return MappSb3VecEnv(num_envs, **arguments)
