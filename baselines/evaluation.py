@@ -158,7 +158,6 @@ def evaluate(
     optima: Optima | None = None,
     n_kept: int = 0,
     progress: str | None = None,
-    observation: str = "global",
 ) -> Evaluation:
     """Let a policy play each problem once.
 
@@ -176,9 +175,6 @@ def evaluate(
         Of how many problems, the first ones, the joint actions are kept, to be replayed or drawn.
     progress
         Label of a progress bar, shown in a terminal; none by default.
-    observation
-        What the policy sees: global observations (B, N + 2K), or for the other kinds those of all
-        agents, (B, N, ...).
 
     Raises
     ------
@@ -202,7 +198,6 @@ def evaluate(
         n_agents=setting.n_agents,
         n_landmarks=setting.n_landmarks,
         max_cycles=setting.max_cycles,
-        observation=observation,
     )
     costs = {name: np.full(n_problems, np.inf) for name in OBJECTIVES}
     success = np.zeros(n_problems, np.bool_)

@@ -4,13 +4,15 @@ Usage, here with random moves that do not bump::
 
     python examples/beside_optimum.py --problems 200
 
-Other scripts of this folder import :func:`judge`. It plays all problems side by side, so that a
-network is asked once a step for all of them. Needs ``mapp_env`` alone.
+Other scripts of this folder import :func:`judge`, or :func:`report`, which prints it. It plays all
+problems side by side, so that a network is asked once a step for all of them. Needs ``mapp_env``
+alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -87,6 +89,42 @@ def judge(act: Acting, landmarks: np.ndarray, **arguments: Any) -> Judgement:
     gaps = cover_times[solved] / optima[solved] - 1
     gap = 100 * float(gaps.mean()) if solved.any() else float("nan")
     return Judgement(100 * float(solved.mean()), gap, float(returns.mean()))
+
+
+def report(
+    seconds: float, returns: Sequence[float], act: Acting, n_problems: int, **arguments: Any
+) -> None:
+    """Print what a training has come to: returns of its first and last episodes, and a judgement.
+
+    Parameters
+    ----------
+    seconds
+        How long it took.
+    returns
+        Undiscounted, of the training's episodes in order, at least one. Their problems are taken
+        to be random ones, so that some of those judged on may have been met.
+    act
+        The policy, greedy.
+    n_problems
+        On how many problems it is judged.
+    arguments
+        Those of ``parallel_env``: what the policy sees, and the reward that is counted.
+
+    Raises
+    ------
+    ValueError
+        If no episode has ended.
+    """
+    if len(returns) == 0:
+        raise ValueError("returns must hold those of at least one episode, got none: train longer")
+    count = max(1, min(200, len(returns) // 2))
+    first, last = np.mean(returns[:count]), np.mean(returns[-count:])
+    print(f"{len(returns)} episodes in {seconds:.0f} CPU seconds")
+    print(f"return of the first and the last {count}: {first:.1f} -> {last:.1f}")
+    task = mapp_v0.parallel_env(**arguments).task
+    met = min(1.0, len(returns) / math.comb(task.grid.reachable.size, task.n_landmarks))
+    print(f"greedy on {n_problems} problems, at most {met:.1%} of them met in training:")
+    print(judge(act, unseen_landmarks(n_problems, **arguments), **arguments))
 
 
 def main() -> None:

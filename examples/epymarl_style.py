@@ -22,10 +22,10 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
+from beside_optimum import report
 from torch import nn
 
 import mapp_env  # noqa: F401 - registers mapp_env/Tuple-v0
-from baselines.other_trainers import report
 
 
 @dataclass
@@ -174,11 +174,11 @@ def main(args: Args) -> None:
             target.load_state_dict(network.state_dict())
     env.close()
 
-    def act(observations: np.ndarray) -> np.ndarray:
+    def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         with torch.no_grad():
             return network(torch.from_numpy(with_numbers(observations))).argmax(2).numpy()
 
-    report("epymarl_style.py", elapsed, returns, act, "geodesic", args.problems)
+    report(elapsed, returns, act, args.problems, observation="geodesic")
 
 
 if __name__ == "__main__":

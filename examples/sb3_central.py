@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
+from beside_optimum import report
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 
 import mapp_env  # noqa: F401 - registers mapp_env/Central-v0
-from baselines.other_trainers import report
 from mapp_env.adapters.sb3_returns import EpisodeReturns
 
 
@@ -73,11 +73,11 @@ def main(args: Args) -> None:
     watch = EpisodeReturns(args.seconds)
     model.learn(args.steps, callback=watch)
 
-    def act(observations: np.ndarray) -> np.ndarray:
+    def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         numbers = model.predict(observations, deterministic=True)[0]
         return np.stack(np.unravel_index(numbers, (4, 4, 4)), axis=1)  # the first agent leads
 
-    report("sb3_central.py", watch.elapsed, watch.returns, act, "geodesic", args.problems)
+    report(watch.elapsed, watch.returns, act, args.problems, observation="geodesic")
 
 
 if __name__ == "__main__":

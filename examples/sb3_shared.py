@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
+from beside_optimum import report
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from baselines.other_trainers import report
 from mapp_env.adapters.sb3_returns import EpisodeReturns
 from mapp_env.adapters.sb3_shared import make_sb3_shared
 
@@ -64,13 +64,13 @@ def main(args: Args) -> None:
     watch = EpisodeReturns(args.seconds)
     model.learn(10**9, callback=watch)
 
-    def act(observations: np.ndarray) -> np.ndarray:
+    def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         rows = observations.reshape(-1, observations.shape[-1])
         return model.predict(rows, deterministic=True)[0].reshape(observations.shape[:2])
 
     # The agents of a team end together, with the same return.
     returns = watch.returns[:: envs.n_agents]
-    report("sb3_shared.py", watch.elapsed, returns, act, "geodesic", args.problems)
+    report(watch.elapsed, returns, act, args.problems, observation="geodesic")
 
 
 if __name__ == "__main__":

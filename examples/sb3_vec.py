@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
+from beside_optimum import report
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
-from baselines.other_trainers import report
 from mapp_env.adapters.sb3_returns import EpisodeReturns
 from mapp_env.adapters.sb3_vec import make_sb3_vec
 
@@ -64,10 +64,10 @@ def main(args: Args) -> None:
     watch = EpisodeReturns(args.seconds)
     model.learn(10**9, callback=watch)
 
-    def act(observations: np.ndarray) -> np.ndarray:
+    def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         return model.predict(observations, deterministic=True)[0]
 
-    report("sb3_vec.py", watch.elapsed, watch.returns, act, "geodesic", args.problems)
+    report(watch.elapsed, watch.returns, act, args.problems, observation="geodesic")
 
 
 if __name__ == "__main__":

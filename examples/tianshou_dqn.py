@@ -24,6 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
+from beside_optimum import report
 from tianshou.algorithm import DQN
 from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
 from tianshou.algorithm.multiagent.marl import MultiAgentOffPolicyAlgorithm
@@ -33,7 +34,6 @@ from tianshou.env import DummyVectorEnv, PettingZooEnv
 from tianshou.trainer import OffPolicyTrainer, OffPolicyTrainerParams
 from tianshou.utils.net.common import Net
 
-from baselines.other_trainers import report
 from mapp_env import mapp_v0
 
 
@@ -145,7 +145,7 @@ def main(args: Args) -> None:
             learner.policy.set_eps_inference(max(0.05, 1.0 - 2.0 * elapsed / args.seconds))
         trainer.execute_epoch()
 
-    def act(observations: np.ndarray) -> np.ndarray:
+    def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         with torch.no_grad():
             values = [
                 learner.policy.model(observations[:, agent])[0]
@@ -153,7 +153,7 @@ def main(args: Args) -> None:
             ]
         return torch.stack(values, 1).argmax(2).numpy()
 
-    report("tianshou_dqn.py", elapsed, returns, act, "geodesic", args.problems)
+    report(elapsed, returns, act, args.problems, observation="geodesic")
 
 
 if __name__ == "__main__":

@@ -35,6 +35,8 @@ NOT_RUN = {
     "python baselines/repair.py": "trains for minutes",
     "python baselines/export_playground.py": "plays the universe, or writes into the repository",
     "MAPP_PLAYGROUND_PROBLEMS=10000 python -m pytest": "is a longer part of this suite",
+    "python examples/ray_seeds.py": "trains dozens of times",
+    "python examples/ray_tune.py": "trains for minutes",
     "chromium": "takes a picture with a browser, which not everybody has",
     "python baselines/distill.py": "trains for an hour",
     "python baselines/compare.py": "trains thirty times",
@@ -204,7 +206,9 @@ def test_long_commands_are_understood(command: str, monkeypatch: pytest.MonkeyPa
         read_installation(shlex.split(command)[2:])
     elif words[:3] == ["python", "-m", "pytest"] or words[1:4] == ["python", "-m", "pytest"]:
         for word in words[words.index("pytest") + 1 :]:
-            known = word in ("-n", "2", "-k", "rounded") or (REPOSITORY / word).exists()
+            known = (
+                word in ("-n", "2", "-k", "rounded", "-m", "slow") or (REPOSITORY / word).exists()
+            )
             assert known, f"{command}: {word}"
     elif words[0] == "chromium":
         for file in re.findall(r"docs/[\w./]+", command):

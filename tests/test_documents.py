@@ -21,10 +21,21 @@ EXAMPLES = {
     "rollout.py": ["--out", "{folder}/rollout.gif"],
     "batched_rollout.py": ["--num-envs", "256", "--steps", "120"],
     "beside_optimum.py": ["--problems", "20"],
+    "sb3_shared.py": ["--seconds", "1", "--problems", "5"],
+    "sb3_central.py": ["--seconds", "1", "--problems", "5"],
+    "sb3_vec.py": ["--seconds", "1", "--problems", "5"],
+    "epymarl_style.py": ["--seconds", "1", "--problems", "5"],
     "torchrl_vdn.py": ["--steps", "80", "--updates-per-batch", "1", "--problems", "5"],
 }
-# Run by hand: what they need does not install beside the rest. Their docstrings say how.
-EXAMPLES_APART = {"benchmarl_task.py": ".venv-benchmarl/bin/pip install"}
+# Run by hand: what they need does not install beside the rest, or they start many trainings (which
+# tests/test_ray.py does as well). Their docstrings say how.
+EXAMPLES_APART = {
+    "benchmarl_task.py": ".venv-benchmarl/bin/pip install",
+    "rllib_ppo.py": ".venv-rllib/bin/pip install",
+    "tianshou_dqn.py": ".venv-tianshou/bin/pip install",
+    "ray_seeds.py": "python examples/ray_seeds.py --out runs/compare --seeds 5",
+    "ray_tune.py": "python examples/ray_tune.py --trials 8",
+}
 
 
 def run(command: list[str], folder: Path) -> str:
