@@ -35,6 +35,15 @@ NOT_RUN = {
     "python baselines/repair.py": "trains for minutes",
     "python baselines/export_playground.py": "plays the universe, or writes into the repository",
     "MAPP_PLAYGROUND_PROBLEMS=10000 python -m pytest": "is a longer part of this suite",
+    "python examples/sb3_shared.py": "trains for a minute",
+    "python examples/sb3_vec.py": "trains for a minute",
+    "python examples/sb3_central.py": "trains for a minute",
+    "python examples/epymarl_style.py": "trains for a minute",
+    ".venv-rllib/bin/python": "trains for a minute, elsewhere",
+    ".venv-tianshou/bin/python": "trains for a minute, elsewhere",
+    ".venv-benchmarl/bin/pip": "installs",
+    "OMP_NUM_THREADS=1 .venv-benchmarl/bin/python": "trains for a minute, elsewhere",
+    "grep": "makes a list for pip",
     "python examples/ray_seeds.py": "trains dozens of times",
     "python examples/ray_tune.py": "trains for minutes",
     "chromium": "takes a picture with a browser, which not everybody has",
@@ -114,6 +123,7 @@ def start(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
         script = REPOSITORY / words[1]
         assert script.is_file(), f"{command}: there is no {words[1]}"
         monkeypatch.setattr(sys, "argv", words[1:])
+        monkeypatch.syspath_prepend(script.parent)  # as Python does
         runpy.run_path(str(script), run_name="__main__")
 
 
@@ -181,7 +191,7 @@ def read_by_script(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = stopped.value.args[0]
     if isinstance(taken, tuple):  # a study, which hands what is not its own to every training
         script = importlib.import_module(command.split()[1].removesuffix(".py").replace("/", "."))
-        script.plan_trials(*taken)
+        getattr(script, "compare", script).plan_trials(*taken)
 
 
 def read_installation(words: list[str]) -> None:
@@ -198,6 +208,18 @@ def read_installation(words: list[str]) -> None:
         assert set(filter(None, (extras or "").split(","))) <= {*PROJECT["optional-dependencies"]}
 
 
+def read_elsewhere(command: str) -> None:
+    """Check that a script that runs in another virtual environment knows what it is told."""
+    words = shlex.split(command)
+    assert ".venv" in command
+    scripts = [index for index, word in enumerate(words) if word.endswith(".py")]
+    for index in scripts:
+        text = (REPOSITORY / words[index]).read_text(encoding="utf-8")
+        for option in words[index + 1 :]:
+            known = option.removeprefix("--").replace("-", "_")
+            assert option == "..." or option in text or known in text, f"{command}: {option}"
+
+
 @pytest.mark.parametrize("command", LONG)
 def test_long_commands_are_understood(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its script exists and takes all its options; what it installs, checks or makes is there."""
@@ -210,11 +232,13 @@ def test_long_commands_are_understood(command: str, monkeypatch: pytest.MonkeyPa
                 word in ("-n", "2", "-k", "rounded", "-m", "slow") or (REPOSITORY / word).exists()
             )
             assert known, f"{command}: {word}"
+    elif words[0] == "grep" or any(word.startswith(".venv-") for word in words[:2]):
+        read_elsewhere(command)
     elif words[0] == "chromium":
         for file in re.findall(r"docs/[\w./]+", command):
             assert (REPOSITORY / file).is_file(), f"{command}: {file}"
     elif words[:3] == ["python", "-m", "venv"]:
-        assert words[3:] == [".venv"]
+        assert re.fullmatch(r"\.venv(-[a-z]+)?", " ".join(words[3:]))
     elif words[0] in ("ruff", "mypy"):
         lines = (REPOSITORY / ".ci" / "run").read_text(encoding="utf-8").splitlines()
         assert f".venv/bin/{command}" in lines
