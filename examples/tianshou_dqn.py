@@ -18,8 +18,13 @@ own (in bash):
 from __future__ import annotations
 
 import logging
+import os
+import sys
 import time
 from dataclasses import dataclass
+
+if not sys.stderr.isatty():
+    os.environ.setdefault("TQDM_DISABLE", "1")  # read when Tianshou is imported
 
 import numpy as np
 import torch
