@@ -1,11 +1,13 @@
 """A study run as Ray tasks is the serial one, also if a worker is killed in the middle of it."""
 
+import contextlib
 import csv
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,8 @@ from baselines.studies import MEASURES
 
 pytest.importorskip("ray")
 # Each starts a Ray of its own: `python -m pytest -m slow tests/test_ray.py`.
-pytestmark = pytest.mark.slow
+# On a busy machine Ray alone takes minutes to start.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "ray_seeds.py"
 GRID = {"presets": ("default", "paper"), "learners": ("meta",), "seeds": 1, "default_updates": 4}
@@ -28,29 +31,37 @@ WORDS = [
 SAME = ("metrics.csv", "policy.safetensors", "evaluation.csv")
 
 
-def start(out: Path, home: Path, *words: str) -> "subprocess.Popen[str]":
-    """Start the study with Ray."""
+@contextlib.contextmanager
+def start(out: Path, home: Path, *words: str) -> Iterator["subprocess.Popen[str]"]:
+    """Start the study with Ray; if the test fails, end it."""
     command = [sys.executable, str(SCRIPT), "--out", str(out), "--jobs", "2", *words, *WORDS]
     for name, value in GRID.items():
         values = value if isinstance(value, tuple) else (str(value),)
         command += [f"--{name.replace('_', '-')}", *values]
     # Ray keeps a token in the home folder.
     environment = {**os.environ, "HOME": str(home), "RAY_USAGE_STATS_ENABLED": "0"}
-    return subprocess.Popen(
+    with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    ) as study:
+        try:
+            yield study
+        finally:
+            if study.poll() is None:
+                study.terminate()
 
 
-def process_in_the_middle(run: Path, deadline: float = 120.0) -> int:
+def process_in_the_middle(
+    study: "subprocess.Popen[str]", run: Path, deadline: float = 300.0
+) -> int:
     """Wait until a training has saved twice and is not through; return the process it runs in."""
     end = time.monotonic() + deadline
-    while time.monotonic() < end:
+    while time.monotonic() < end and study.poll() is None:
         if len(list((run / "checkpoints").glob("*.json"))) == 2:
             assert not (run / "evaluation.csv").exists()
             log = run.with_name(run.name + ".log").read_text()
             return int(log.removeprefix("process ").split()[0])
         time.sleep(0.005)
-    raise AssertionError(f"{run}: no second checkpoint in {deadline} seconds")
+    raise AssertionError(f"{run}: no second checkpoint; exit code {study.poll()}")
 
 
 def untimed_csv(path: Path) -> list[dict[str, str]]:
@@ -78,9 +89,9 @@ def serial(tmp_path_factory):
 def test_killed_worker_changes_nothing(serial, tmp_path):
     """After kill -9 of a worker in mid-training, weights and tables are those of compare.py."""
     out = tmp_path / "study"
-    study = start(out, tmp_path)
-    os.kill(process_in_the_middle(out / "default-meta-seed0"), signal.SIGKILL)
-    printed, _ = study.communicate(timeout=240)
+    with start(out, tmp_path) as study:
+        os.kill(process_in_the_middle(study, out / "default-meta-seed0"), signal.SIGKILL)
+        printed, _ = study.communicate(timeout=500)
     assert study.returncode == 0, printed
     log = (out / "default-meta-seed0.log").read_text()
     assert log.count("process ") == 2
@@ -96,10 +107,10 @@ def test_killed_worker_changes_nothing(serial, tmp_path):
 def test_a_signal_stops_the_tasks_with_a_checkpoint(serial, tmp_path):
     """SIGTERM ends the study with 143; compare.py goes on with what it left, to the same table."""
     out = tmp_path / "study"
-    study = start(out, tmp_path)
-    process_in_the_middle(out / "default-meta-seed0")
-    study.send_signal(signal.SIGTERM)
-    printed, _ = study.communicate(timeout=120)
+    with start(out, tmp_path) as study:
+        process_in_the_middle(study, out / "default-meta-seed0")
+        study.send_signal(signal.SIGTERM)
+        printed, _ = study.communicate(timeout=500)
     assert study.returncode == 128 + signal.SIGTERM, printed
     assert "the same command goes on" in printed
     assert "stopped early" in (out / "default-meta-seed0.log").read_text()
@@ -111,9 +122,9 @@ def test_a_signal_stops_the_tasks_with_a_checkpoint(serial, tmp_path):
 def test_what_is_lost_too_often_is_reported(tmp_path):
     """With no retry allowed, a killed worker ends the study with an error that names it."""
     out = tmp_path / "study"
-    study = start(out, tmp_path, "--max-retries", "0")
-    os.kill(process_in_the_middle(out / "default-meta-seed0"), signal.SIGKILL)
-    printed, _ = study.communicate(timeout=240)
+    with start(out, tmp_path, "--max-retries", "0") as study:
+        os.kill(process_in_the_middle(study, out / "default-meta-seed0"), signal.SIGKILL)
+        printed, _ = study.communicate(timeout=500)
     assert study.returncode == 1
     assert "error: these trainings failed: default-meta-seed0: " in printed
     assert not (out / "comparison.md").exists()
