@@ -498,15 +498,17 @@ def test_compiled_and_plain_kernels_play_the_same() -> None:
 
 
 def test_import_is_light() -> None:
-    """Importing the package, and playing without drawing, loads no torch and no drawing library."""
+    """Importing the package, and playing without drawing, loads no torch, drawing or trainer."""
     code = (
         "import sys, mapp_env\n"
         "from mapp_env import mapp_v0\n"
-        "heavy = {'torch', 'matplotlib', 'pygame', 'PIL'}\n"
+        "import gymnasium, mapp_env.adapters\n"
+        "heavy = {'torch', 'matplotlib', 'pygame', 'PIL', 'stable_baselines3', 'supersuit'}\n"
         "print(sorted(heavy & set(sys.modules)))\n"
         "env = mapp_v0.parallel_env(); env.reset(seed=0)\n"
         "env.step(dict.fromkeys(env.agents, 0))\n"
         "mapp_env.make_vec(2).reset(seed=0)\n"
+        "gymnasium.make('mapp_env/Tuple-v0').reset(seed=0)\n"
         "import mapp_env.rendering\n"
         "print(sorted(heavy & set(sys.modules)))\n"
     )

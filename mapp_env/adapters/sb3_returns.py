@@ -16,8 +16,9 @@ class EpisodeReturns(BaseCallback):
     Parameters
     ----------
     seconds : float
-        CPU seconds of this process after which to stop; what a busy machine takes away does not
-        count. The update that would follow is left out.
+        CPU seconds of this process after which to stop, from the first step on: what a busy
+        machine takes away does not count, nor what is compiled once. The update that would follow
+        is left out.
 
     Attributes
     ----------
@@ -26,7 +27,7 @@ class EpisodeReturns(BaseCallback):
         ``infos[i]["episode"]``: ``make_sb3_vec`` has it, others get it from ``Monitor`` or
         ``VecMonitor``.
     elapsed : float
-        CPU seconds since the start of ``learn``.
+        CPU seconds since the first step.
     """
 
     def __init__(self, seconds: float = float("inf")) -> None:
@@ -34,14 +35,13 @@ class EpisodeReturns(BaseCallback):
         self.seconds = seconds
         self.returns: list[float] = []
         self.elapsed = 0.0
-        self._started = 0.0
-
-    def _on_training_start(self) -> None:
-        self._started = time.process_time()
+        self._started: float | None = None
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
         for index in np.flatnonzero(self.locals["dones"]).tolist():
             self.returns.append(float(infos[index]["episode"]["r"]))
+        if self._started is None:
+            self._started = time.process_time()
         self.elapsed = time.process_time() - self._started
         return self.elapsed < self.seconds
