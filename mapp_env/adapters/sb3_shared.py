@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 import supersuit
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
+from mapp_env.adapters.sb3_rows import RowsVecEnv
 from mapp_env.parallel_env import MappParallelEnv
 from mapp_env.validation import MAX_SEED, check_count, describe
 from mapp_env.vector_env import MAX_ENVS
@@ -18,7 +18,7 @@ from mapp_env.vector_env import MAX_ENVS
 __all__ = ["SharedVecEnv", "make_sb3_shared"]
 
 
-class SharedVecEnv(VecEnv):
+class SharedVecEnv(RowsVecEnv):
     """A view of SuperSuit's vector environment in which seeds and time-outs arrive.
 
     Row ``i * N + a`` is agent ``a`` of environment ``i``: one network that commands every row by
@@ -48,7 +48,7 @@ class SharedVecEnv(VecEnv):
         self.n_agents = n_agents
         self._seed: int | None = None
         self._actions: Any = None
-        super().__init__(venv.num_envs, venv.observation_space, venv.action_space)
+        super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next :meth:`reset`.
@@ -103,42 +103,6 @@ class SharedVecEnv(VecEnv):
             for info, late in zip(found, (truncations & ~terminations).tolist(), strict=True)
         ]
         return np.array(observations), np.array(rewards), terminations | truncations, infos
-
-    # -- what else a VecEnv has --------------------------------------------------------
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return the attribute of SuperSuit's environment once for each row asked for."""
-        return [getattr(self.venv, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: rows are agents, and have no attributes of their own.
-
-        Raises
-        ------
-        ValueError
-            Always.
-        """
-        raise ValueError(f"{attr_name} cannot be set: rows are agents of shared environments")
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Refuse: rows are agents, and have no methods of their own.
-
-        Raises
-        ------
-        ValueError
-            Always.
-        """
-        raise ValueError(f"{method_name}() cannot be called by row: call it on .venv")
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return that no row is wrapped in anything."""
-        return [False] * len(list(self._get_indices(indices)))
-
-    def close(self) -> None:
-        """Close the environments."""
-        self.venv.close()
 
 
 def make_sb3_shared(num_envs: int, num_cpus: int = 0, **arguments: Any) -> SharedVecEnv:

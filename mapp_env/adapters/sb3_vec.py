@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
+from mapp_env.adapters.sb3_rows import RowsVecEnv
 from mapp_env.row_seeds import spread_seed
 from mapp_env.validation import MAX_SEED, check_count, describe
 from mapp_env.vector_env import MappVectorEnv
@@ -21,7 +21,7 @@ NOTHING: Mapping[str, Any] = MappingProxyType({})
 """The info of a row whose episode goes on. One for all: a dict a row would take half a step."""
 
 
-class MappSb3VecEnv(VecEnv):
+class MappSb3VecEnv(RowsVecEnv):
     """Many problems for one meta-agent, stepped as one batch, as Stable-Baselines3 wants them.
 
     A row that ends starts its next episode in the same step. Its info holds
@@ -67,7 +67,8 @@ class MappSb3VecEnv(VecEnv):
         self._lengths = np.zeros(self.engine.num_envs, np.int64)
         self._started = time.perf_counter()
         super().__init__(
-            self.engine.num_envs,
+            self.engine,
+            "engine",
             self.engine.single_observation_space,
             self.engine.single_action_space,
         )
@@ -201,46 +202,12 @@ class MappSb3VecEnv(VecEnv):
             ) in zip(*(column[ended].tolist() for column in columns), strict=True)
         ]
 
-    # -- what else a VecEnv has --------------------------------------------------------
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return the engine's attribute once for each row asked for."""
-        return [getattr(self.engine, attr_name)] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: rows have no attributes of their own.
-
-        Raises
-        ------
-        ValueError
-            Always.
-        """
-        raise ValueError(f"{attr_name} cannot be set: rows of the engine have no attributes")
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Refuse: rows have no methods of their own.
-
-        Raises
-        ------
-        ValueError
-            Always.
-        """
-        raise ValueError(f"{method_name}() cannot be called by row: call it on .engine")
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return that no row is wrapped in anything."""
-        return [False] * len(list(self._get_indices(indices)))
+    # -- pictures ----------------------------------------------------------------------
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return a picture of each row, with ``render_mode="rgb_array"``."""
         pictures = self.engine.render()
         return [None] * self.num_envs if pictures is None else pictures
-
-    def close(self) -> None:
-        """Close the engine; may be called again."""
-        self.engine.close()
 
 
 def make_sb3_vec(num_envs: int, **arguments: Any) -> MappSb3VecEnv:
