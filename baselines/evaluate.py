@@ -38,10 +38,9 @@ from baselines.guidance import Acting, Guidance, GuidedPolicy
 from baselines.policy import (
     NearestLandmarkPolicy,
     RandomPolicy,
-    find_weights,
-    load_policy,
 )
-from baselines.settings import N_ACTIONS, Setting, check_fits, find_grid, read_setting
+from baselines.settings import N_ACTIONS, Setting, find_grid
+from baselines.trained import load_trained
 
 
 @dataclass
@@ -100,10 +99,7 @@ def main(args: Args) -> None:
         else:
             policy = NearestLandmarkPolicy(setting.grid, setting.n_agents, setting.n_landmarks)
     else:
-        policy = trained = load_policy(args.policy)
-        folder = find_weights(args.policy).parent
-        setting, seen = read_setting(folder)
-        check_fits(trained.spec, setting, folder)
+        policy, setting, seen = load_trained(args.policy)
     label = args.policy
     if args.guidance > 0:
         guidance = Guidance(

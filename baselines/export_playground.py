@@ -27,10 +27,10 @@ import tyro
 
 from baselines.evaluation import evaluate, every_problem
 from baselines.networks import NetworkSpec
-from baselines.policy import find_weights
+from baselines.policy import find_weights, load_policy
 from baselines.runs import write_atomically
 from baselines.settings import Setting
-from baselines.solve import load
+from baselines.trained import load_trained
 from mapp_env import Grid, make_grid
 
 PLAYGROUND = Path(__file__).resolve().parents[1] / "docs" / "playground"
@@ -58,7 +58,7 @@ def export(policy: str) -> str:
         If there is no such policy, or the page cannot run it: it is of another setting or kind,
         or has weights that 16 bits have no room for.
     """
-    trained, setting = load(policy)
+    trained, setting, _ = load_trained(policy)
     check_setting(policy, setting)
     check_network(policy, trained.spec)
     file = find_weights(policy)
@@ -160,8 +160,8 @@ def kept_rows(spec: NetworkSpec, grid: Grid) -> dict[str, np.ndarray]:
 
 def count_changed(policy: str) -> tuple[int, int, int]:
     """Return how many problems there are, and on how many rounding changes actions, or steps."""
-    exact, setting = load(policy)
-    rounded, _ = load(policy)
+    exact, setting, _ = load_trained(policy)
+    rounded = load_policy(policy)
     with torch.no_grad():
         for tensor in rounded.network.parameters():
             tensor.copy_(tensor.half().float())

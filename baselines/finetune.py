@@ -43,8 +43,9 @@ from baselines.evaluation import (
 from baselines.imagined_replay import UNKNOWN, is_on, join
 from baselines.meta_dqn import joint_values
 from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
-from baselines.policy import NetworkPolicy, find_weights
-from baselines.settings import N_ACTIONS, Setting, read_setting
+from baselines.policy import NetworkPolicy
+from baselines.settings import N_ACTIONS, Setting
+from baselines.trained import load_trained
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
@@ -259,9 +260,8 @@ def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[
 def main(args: Args) -> int:
     """Fine-tune on one problem; return the exit code."""
     torch.set_num_threads(1)
-    policy, setting = solving.load(args.policy)
+    policy, setting, seen = load_trained(args.policy)
     if args.problems:
-        seen = read_setting(find_weights(args.policy).parent)[1]
         study(args, policy, setting, seen)
         return 0
     problem = solving.make_problem(setting, args.landmarks)

@@ -40,6 +40,7 @@ from baselines.runs import (
     read_config,
 )
 from baselines.settings import Setting
+from baselines.trained import Trained, load_trained
 
 METRICS = ("updates", "loss")
 LOGGED = 100  # updates in a row of metrics.csv
@@ -212,6 +213,21 @@ def own_options(args: Chosen, algorithm: str) -> Chosen:
         return kind(**{**own, "out": None, "resume": args.resume})
     except TypeError as error:
         raise ValueError(f"{args.resume}: {error}") from error
+
+
+def starting_point(policy: str | Path | None) -> Trained:
+    """Return the meta-agent that a training starts from.
+
+    Of a resumed run it is in its own folder, until it has something better.
+
+    Raises
+    ------
+    ValueError
+        If none is named, or there is none of this name.
+    """
+    if policy is None:
+        raise ValueError("policy must be the run folder of a trained meta-agent, got none")
+    return load_trained(policy)
 
 
 def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals) -> None:

@@ -25,13 +25,20 @@ import torch
 import tyro
 from torch import Tensor, nn
 
+from baselines.checkpoints import part
 from baselines.checks import check_count, check_number
 from baselines.episodes import draw_problems, make_envs, play
 from baselines.evaluation import count_problems, evaluate, every_problem
-from baselines.imitation import ImitationOptions, Pupil, own_options, run_imitation
+from baselines.imitation import (
+    ImitationOptions,
+    Pupil,
+    own_options,
+    run_imitation,
+    starting_point,
+)
 from baselines.networks import Network
-from baselines.policy import NetworkPolicy, find_weights, load_policy
-from baselines.settings import Setting, check_fits, read_setting
+from baselines.policy import NetworkPolicy
+from baselines.settings import Setting
 
 ALGORITHM = "repair"
 
@@ -120,11 +127,11 @@ class Repaired(Pupil):
             self.play()
         self.left -= 1
         seen = self.seen[self.rng.integers(len(self.seen), size=args.batch_size)]
-        with torch.inference_mode():
+        with torch.no_grad():
             wanted = self.model(torch.from_numpy(seen)).log_softmax(1)
         given = self.network(torch.from_numpy(seen)).log_softmax(1)
         loss = args.anchor * nn.functional.kl_div(
-            given, wanted.clone(), reduction="batchmean", log_target=True
+            given, wanted, reduction="batchmean", log_target=True
         )
         if len(self.taught_seen):
             rows = self.rng.integers(len(self.taught_seen), size=args.taught_batch)
@@ -205,14 +212,8 @@ class Repaired(Pupil):
 
     def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`own_arrays` returned."""
-        prefix = "model."
-        self.model.load_state_dict(
-            {
-                name.removeprefix(prefix): torch.from_numpy(array.copy())
-                for name, array in arrays.items()
-                if name.startswith(prefix)
-            }
-        )
+        weights = part(arrays, "model")
+        self.model.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
         self.seen, self.left = arrays["round.seen"].copy(), int(arrays["round.left"])
         self.taught_seen = arrays["taught.seen"].copy()
         self.taught_joint = arrays["taught.joint"].copy()
@@ -222,16 +223,10 @@ class Repaired(Pupil):
 def main(args: Args) -> int:
     """Mend and evaluate; return the exit code."""
     args = own_options(args, ALGORITHM)
-    # A resumed run has what it started from in its own folder, until it has something better.
-    start = args.policy if args.resume is None else args.resume
-    if start is None:
-        raise ValueError("policy must be the run folder of a trained meta-agent, got none")
-    trained = load_policy(start)
-    folder = find_weights(start).parent
-    setting, seen = read_setting(folder)
-    check_fits(trained.spec, setting, folder)
-    network = trained.network
-    return run_imitation(args, ALGORITHM, setting, lambda: Repaired(args, setting, network), seen)
+    policy, setting, seen = starting_point(args.policy if args.resume is None else args.resume)
+    return run_imitation(
+        args, ALGORITHM, setting, lambda: Repaired(args, setting, policy.network), seen
+    )
 
 
 if __name__ == "__main__":

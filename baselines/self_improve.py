@@ -39,10 +39,10 @@ from baselines.imitation import (
     good_actions_loss,
     own_options,
     run_imitation,
+    starting_point,
 )
 from baselines.networks import Network, NetworkSpec, split_joint
-from baselines.policy import find_weights, load_policy
-from baselines.settings import Setting, check_fits, read_setting
+from baselines.settings import Setting
 
 ALGORITHM = "self_improve"
 MAX_AGAIN = 4096  # problems that wait to be played again; the oldest is forgotten
@@ -280,19 +280,11 @@ def sharpen(network: Network, factor: float) -> None:
 def main(args: Args) -> int:
     """Improve and evaluate; return the exit code."""
     args = own_options(args, ALGORITHM)
-    # A resumed run has what it started from in its own folder, until it has something better.
-    start = args.policy if args.resume is None else args.resume
-    if start is None:
-        raise ValueError("policy must be the run folder of a trained meta-agent, got none")
-    trained = load_policy(start)
-    folder = find_weights(start).parent
-    setting, seen = read_setting(folder)
-    check_fits(trained.spec, setting, folder)
-    network = trained.network
+    policy, setting, seen = starting_point(args.policy if args.resume is None else args.resume)
     if args.resume is None:
-        sharpen(network, args.sharpness)
+        sharpen(policy.network, args.sharpness)
     return run_imitation(
-        args, ALGORITHM, setting, lambda: SelfImproved(args, setting, network), seen
+        args, ALGORITHM, setting, lambda: SelfImproved(args, setting, policy.network), seen
     )
 
 

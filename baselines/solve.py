@@ -20,8 +20,9 @@ import torch
 import tyro
 
 from baselines.evaluation import evaluate
-from baselines.policy import NetworkPolicy, find_weights, load_policy
-from baselines.settings import Setting, check_fits, read_setting
+from baselines.policy import NetworkPolicy
+from baselines.settings import Setting
+from baselines.trained import load_trained
 from mapp_env import Plan, Problem, replay, solve
 
 
@@ -39,21 +40,6 @@ class Args:
     """where to write the policy's plan: a JSON file"""
     animation: Path | None = None
     """where to play the policy beside the optimum: an animated .gif file"""
-
-
-def load(policy: str) -> tuple[NetworkPolicy, Setting]:
-    """Return a trained policy and what it was trained for.
-
-    Raises
-    ------
-    ValueError
-        If there is no such policy, or its folder does not say what it was trained for.
-    """
-    trained = load_policy(policy)
-    folder = find_weights(policy).parent
-    setting, _ = read_setting(folder)
-    check_fits(trained.spec, setting, folder)
-    return trained, setting
 
 
 def make_problem(setting: Setting, landmarks: tuple[int, ...]) -> Problem:
@@ -126,7 +112,7 @@ def save(args: Args, problem: Problem, plans: dict[str, Plan], optimum: Plan) ->
 def main(args: Args) -> int:
     """Solve one problem; return the exit code."""
     torch.set_num_threads(1)
-    policy, setting = load(args.policy)
+    policy, setting, _ = load_trained(args.policy)
     problem = make_problem(setting, args.landmarks)
     start = time.perf_counter()
     plan = solve_by_policy(policy, setting, problem)
