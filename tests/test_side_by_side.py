@@ -58,8 +58,8 @@ def test_captions_tell_costs_at_the_end(tmp_path: Path) -> None:
 )
 def test_outcome_in_words(plan: mapp_env.Plan, words: str) -> None:
     """What is written is the plan's cost, whether it is proven, and its gap where there is one."""
-    notes = side_by_side.gaps({"this": plan, "optimum": OPTIMUM})
-    assert side_by_side._outcome(plan, notes["this"]).startswith(words)
+    gaps = side_by_side.gaps({"this": plan, "optimum": OPTIMUM})
+    assert side_by_side._outcome(plan, gaps["this"].get("cover_time")).startswith(words)
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path: Path) -> None:

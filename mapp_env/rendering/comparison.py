@@ -13,7 +13,7 @@ from mapp_env.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering.figures import DPI, Panel, costs_of, draw_plan, save_figure
 from mapp_env.rendering.palette import INK, to_hex
-from mapp_env.rendering.rivals import check_plans, gaps
+from mapp_env.rendering.rivals import Gap, check_plans, gaps
 
 __all__ = ["compare_plans"]
 
@@ -57,7 +57,7 @@ def compare_plans(
     check_plans(problem, plans)
     if path is not None:
         check_writable(path)
-    notes = gaps(plans)
+    behind = gaps(plans)
     panel = Panel(problem.grid, problem.n_agents, LARGE_SIDE, ABOVE)
     columns = min(len(plans), COLUMNS)
     rows = math.ceil(len(plans) / columns)
@@ -67,7 +67,7 @@ def compare_plans(
         row, col = divmod(index, columns)
         ax = panel.add_axes(figure, col * width, (rows - 1 - row) * height)
         # Line by line, as a title's lines all look alike.
-        draw_plan(problem, plan, ax, f"{costs_of(plan)}\n{notes[label]}")
+        draw_plan(problem, plan, ax, f"{costs_of(plan)}\n{_in_words(behind[label])}")
         ax.annotate(
             label if len(label) <= MAX_LABEL else f"{label[: MAX_LABEL - 3]}...",
             (0.5, 1.0),
@@ -84,3 +84,10 @@ def compare_plans(
     if path is not None:
         save_figure(figure, path)
     return figure
+
+
+def _in_words(behind: Mapping[str, Gap]) -> str:
+    return ", ".join(
+        f"{objective.replace('_', ' ')}: gap {gap:.1%} to the optimum {optimum:g}"
+        for objective, (gap, optimum) in behind.items()
+    )

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from mapp_env.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
-__all__ = ["MAX_PLANS", "check_plans", "gaps"]
+__all__ = ["MAX_PLANS", "Gap", "check_plans", "gaps"]
 
 MAX_PLANS = 12
 
 
-def gaps(plans: Mapping[str, Plan]) -> dict[str, str]:
-    """Return for each plan how far it is from those that are proven optimal, in words.
+class Gap(NamedTuple):
+    """How far a plan is from a proven optimum."""
+
+    gap: float  # (cost - optimum) / optimum
+    optimum: float
+
+
+def gaps(plans: Mapping[str, Plan]) -> dict[str, dict[str, Gap]]:
+    """Return for each plan how far it is from those that are proven optimal, by objective.
 
     Raises
     ------
@@ -22,22 +30,19 @@ def gaps(plans: Mapping[str, Plan]) -> dict[str, str]:
         If a plan costs less than what is said to be the optimum.
     """
     optima = {plan.objective: plan.cost for plan in plans.values() if plan.status == "optimal"}
-    notes = {}
+    found: dict[str, dict[str, Gap]] = {}
     for label, plan in plans.items():
-        parts = []
+        found[label] = {}
         for objective, optimum in optima.items():
-            name = objective.replace("_", " ")
             cost = getattr(plan, objective)
             if cost < optimum:
                 raise ValueError(
-                    f"plans[{describe(label)}] has {name} {cost}, below {optimum}, which another "
-                    "plan has as the proven optimum"
+                    f"plans[{describe(label)}] has {objective.replace('_', ' ')} {cost}, below "
+                    f"{optimum}, which another plan has as the proven optimum"
                 )
             if plan.success and (plan.status, plan.objective) != ("optimal", objective):
-                gap = (cost - optimum) / optimum
-                parts.append(f"{name}: gap {gap:.1%} to the optimum {optimum:g}")
-        notes[label] = ", ".join(parts)
-    return notes
+                found[label][objective] = Gap((cost - optimum) / optimum, optimum)
+    return found
 
 
 def check_plans(problem: object, plans: object) -> None:

@@ -15,7 +15,7 @@ from mapp_env.rendering import icons
 from mapp_env.rendering.animation import save_gif, scenes
 from mapp_env.rendering.palette import INK, PAPER, blend
 from mapp_env.rendering.rgb_array import rgb_array
-from mapp_env.rendering.rivals import check_plans, gaps
+from mapp_env.rendering.rivals import Gap, check_plans, gaps
 from mapp_env.validation import check_count
 
 __all__ = ["animate_plans"]
@@ -70,26 +70,21 @@ def animate_plans(
     """
     check_plans(problem, plans)
     side = check_count("max_side", max_side, 16, 1024)
-    notes = gaps(plans)
+    found = gaps(plans)
     panels = [
-        _panel(problem, plan, label, _outcome(plan, notes[label]), side)
+        _panel(problem, plan, label, _outcome(plan, found[label].get("cover_time")), side)
         for label, plan in plans.items()
     ]
     return save_gif(path, _together(panels), fps, hold, loop)
 
 
-def _outcome(plan: Plan, note: str) -> str:
+def _outcome(plan: Plan, gap: Gap | None) -> str:
     """Return what stands above a plan that is through."""
     if not plan.success:
         return "not every landmark is visited"
     proven = " (proven)" if plan.status == "optimal" and plan.objective == "cover_time" else ""
-    gap = f" ({_gap(note)})" if note.startswith("cover time") else ""
-    return f"cover time {plan.cover_time}{proven or gap}, total distance {plan.total_distance}"
-
-
-def _gap(note: str) -> str:
-    """Return "gap 8.3%" of what :func:`gaps` says first."""
-    return note[note.index("gap") : note.index("%") + 1]
+    behind = "" if gap is None else f" (gap {gap.gap:.1%})"
+    return f"cover time {plan.cover_time}{proven or behind}, total distance {plan.total_distance}"
 
 
 def _panel(problem: Problem, plan: Plan, label: str, outcome: str, side: int) -> Iterator[Frame]:
