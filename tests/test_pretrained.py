@@ -34,7 +34,7 @@ def test_figures_are_those_stated(name):
     result = evaluate(load_policy(name), setting, problems, optima)
     gap, of_gap, optimal, of_optimal = STATED[name]
     figures = result.summary()
-    assert figures["solved %"] > 99.95
+    assert (~result.success).sum() <= (name != "pretrained")  # which leaves one of all 658,008
     assert figures["gap %"] == pytest.approx(gap, abs=of_gap)
     assert figures["optimal %"] == pytest.approx(optimal, abs=of_optimal)
     for cost in ("cover_time", "makespan", "total_distance"):
