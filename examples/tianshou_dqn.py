@@ -6,11 +6,11 @@ each agent learns from what it saw itself. What it reached is in docs/trainers.m
 
     python examples/tianshou_dqn.py                # a minute of CPU time; --help for more
 
-Needs Tianshou 2. It wants an older filelock than the pinned one, so it gets an environment of its
-own (in bash):
+Needs Tianshou 2. It wants older versions of filelock and pandas than the pinned ones, so it gets an
+environment of its own (in bash):
 
     python3 -m venv .venv-tianshou
-    .venv-tianshou/bin/pip install -c <(grep -v filelock constraints.txt) \
+    .venv-tianshou/bin/pip install -c <(grep -vE '^(filelock|pandas)=' constraints.txt) \
         -e ".[baselines]" tianshou==2.0.1
     .venv-tianshou/bin/python examples/tianshou_dqn.py
 """
@@ -18,13 +18,8 @@ own (in bash):
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import time
 from dataclasses import dataclass
-
-if not sys.stderr.isatty():
-    os.environ.setdefault("TQDM_DISABLE", "1")  # read when Tianshou is imported
 
 import numpy as np
 import torch
@@ -134,8 +129,9 @@ def main(args: Args) -> None:
             training_collector=collector,
             max_epochs=1_000_000,
             epoch_num_steps=48 * args.num_envs,
+            # So fewer than 20 gradient steps follow: from 20 on a progress bar cannot be put off.
             collection_step_num_env_steps=24 * args.num_envs,
-            update_step_num_gradient_steps_per_sample=1 / 64,
+            update_step_num_gradient_steps_per_sample=1 / 80,
             batch_size=384,
             multi_agent_return_reduction=lambda rewards: rewards[:, 0],
             verbose=False,
