@@ -27,7 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("playing", "tour_checks", "walking"),
     ("plan",),
     ("solvers", "rendering.rivals", "rendering.comparison"),
-    ("rows", "row_seeds", "display"),
+    ("rows", "row_seeds", "vector_infos", "display"),
     ("simulation",),
     ("rendering.animation", "rendering.side_by_side"),
     ("parallel_env", "central_env", "vector_env"),

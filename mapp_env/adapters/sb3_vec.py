@@ -14,6 +14,7 @@ from mapp_env.adapters.sb3_rows import RowsVecEnv
 from mapp_env.row_seeds import spread_seed
 from mapp_env.validation import MAX_SEED, check_count, describe
 from mapp_env.vector_env import MappVectorEnv
+from mapp_env.vector_infos import Transition
 
 __all__ = ["MappSb3VecEnv", "make_sb3_vec"]
 
@@ -147,37 +148,24 @@ class MappSb3VecEnv(RowsVecEnv):
         ValueError
             If an action is not valid; nothing has moved then.
         """
-        observations, rewards, terminations, truncations, found = self.engine.step(self._actions)
-        dones = terminations | truncations
-        self._returns += rewards
+        transition = self.engine.advance(self._actions)
+        self._returns += transition.rewards
         self._lengths += 1
         infos: list[Any] = [NOTHING] * self.num_envs
-        ended = np.flatnonzero(dones)
-        if len(ended):
-            last = self._last_infos(ended, truncations, found)
-            for index, info in zip(ended.tolist(), last, strict=True):
+        if len(transition.ended):
+            last = self._last_infos(transition)
+            for index, info in zip(transition.ended.tolist(), last, strict=True):
                 infos[index] = info
-            self._returns[ended] = 0.0
-            self._lengths[ended] = 0
-        return observations, rewards.astype(np.float32), dones, infos
+            self._returns[transition.ended] = 0.0
+            self._lengths[transition.ended] = 0
+        rewards = transition.rewards.astype(np.float32)
+        return transition.observations, rewards, transition.dones, infos
 
-    def _last_infos(
-        self, ended: NDArray[np.int64], truncations: NDArray[np.bool_], found: dict[str, Any]
-    ) -> list[dict[str, Any]]:
+    def _last_infos(self, transition: Transition) -> list[dict[str, Any]]:
         """Return the infos of the rows that have ended."""
+        ended, costs = transition.ended, transition.costs
         seconds = round(time.perf_counter() - self._started, 6)
-        metrics = found["final_info"]["metrics"]
         # Columns as lists and dicts written out: this is most of what the adapter costs.
-        columns = [
-            metrics["success"],
-            metrics["cover_time"],
-            metrics["makespan"],
-            metrics["total_distance"],
-            found["final_obs"],
-            truncations,
-            self._returns,
-            self._lengths,
-        ]
         return [
             {
                 "terminal_observation": observation,
@@ -190,16 +178,19 @@ class MappSb3VecEnv(RowsVecEnv):
                 },
                 "episode": {"r": total, "l": length, "t": seconds},
             }
-            for (
-                success,
+            for observation, truncated, success, (
                 cover_time,
                 makespan,
                 distance,
-                observation,
-                truncated,
-                total,
-                length,
-            ) in zip(*(column[ended].tolist() for column in columns), strict=True)
+            ), total, length in zip(
+                transition.last_observations,
+                transition.truncations[ended].tolist(),
+                np.isfinite(costs[:, 0]).tolist(),
+                costs.tolist(),
+                self._returns[ended].tolist(),
+                self._lengths[ended].tolist(),
+                strict=True,
+            )
         ]
 
     # -- pictures ----------------------------------------------------------------------

@@ -1,0 +1,64 @@
+"""What one joint action did in every row, and the infos that Gymnasium wants of it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Transition", "make_infos"]
+
+
+class Transition(NamedTuple):
+    """A step of all B rows, M of which have ended; who steps the engine makes infos of it."""
+
+    observations: NDArray[np.float32]  # (B, ...), of the next episode in rows that restarted
+    rewards: NDArray[np.float64]  # (B,)
+    terminations: NDArray[np.bool_]  # (B,)
+    truncations: NDArray[np.bool_]  # (B,)
+    masks: NDArray[np.int8]  # (B, N, A), of the next episode in rows that restarted
+    dones: NDArray[np.bool_]  # (B,), terminations or truncations
+    ended: NDArray[np.int64]  # (M,), the rows of dones
+    costs: NDArray[np.float64]  # (M, 3), cover time, makespan, total distance (R8); inf: unsolved
+    last_observations: NDArray[np.float32]  # (M, ...)
+    last_masks: NDArray[np.int8]  # (M, N, A)
+    restarted: bool  # whether the rows of ended have begun their next episode
+
+
+def make_infos(transition: Transition) -> dict[str, Any]:
+    """Return the infos of a step as ``gymnasium.vector.SyncVectorEnv`` gives them."""
+    infos: dict[str, Any] = {}
+    if len(transition.ended):
+        add_endings = _add_finals if transition.restarted else _add_metrics
+        add_endings(infos, transition)
+    infos["action_mask"] = transition.masks
+    infos["_action_mask"] = np.ones(len(transition.dones), np.bool_)
+    return infos
+
+
+def _add_metrics(infos: dict[str, Any], transition: Transition) -> None:
+    """Add the metrics of the rows that ended, in the manner of ``VectorEnv._add_info``."""
+    dones, ended, costs = transition.dones, transition.ended, transition.costs
+    columns = np.zeros((3, len(dones)))
+    columns[:, ended] = costs.T
+    success = np.zeros(len(dones), np.bool_)
+    success[ended] = np.isfinite(costs[:, 0])
+    metrics: dict[str, NDArray[Any]] = {"success": success, "_success": dones.copy()}
+    for name, column in zip(("cover_time", "makespan", "total_distance"), columns, strict=True):
+        metrics[name], metrics[f"_{name}"] = column, dones.copy()
+    infos["metrics"], infos["_metrics"] = metrics, dones.copy()
+
+
+def _add_finals(infos: dict[str, Any], transition: Transition) -> None:
+    """Add the last observations and infos of the rows that ended."""
+    dones, ended, observations = transition.dones, transition.ended, transition.last_observations
+    final_obs = np.empty(len(dones), dtype=object)  # of None
+    for index, observation in zip(ended.tolist(), observations, strict=True):
+        final_obs[index] = observation
+    action_mask = np.zeros_like(transition.masks)
+    action_mask[ended] = transition.last_masks
+    final_info = {"action_mask": action_mask, "_action_mask": dones.copy()}
+    _add_metrics(final_info, transition)
+    infos["final_obs"], infos["_final_obs"] = final_obs, dones.copy()
+    infos["final_info"], infos["_final_info"] = final_info, dones.copy()
