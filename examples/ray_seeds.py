@@ -30,16 +30,20 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 import ray
 import tyro
+from filelock import FileLock, Timeout
 
 from baselines import compare
 from baselines.checks import check_count
 from baselines.options import parse_options
-from baselines.runs import StopSignals
+from baselines.runs import LOCK_FILE, StopSignals
 from baselines.studies import gather, last_line, make_folder
 from baselines.trials import Trial, check_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 OBJECT_STORE_BYTES = 200_000_000  # a task returns one number
+LEFT_SECONDS = 120.0
+"""A process that Ray has lost may train on for seconds, and a network file system keeps the lock of
+a lost machine until its lease has run out, after 90 s by default for NFS 4."""
 
 
 @dataclass
@@ -65,9 +69,6 @@ def train(trial: Trial) -> int:
     ValueError
         If the run folder holds anything else, or another process still trains in it.
     """
-    check_folder(trial)
-    if trial.finished:
-        return 0
     # A line at a time: of a process that is killed nothing else is left.
     with (
         trial.log.open("a", buffering=1, encoding="utf-8") as log,
@@ -75,9 +76,20 @@ def train(trial: Trial) -> int:
         contextlib.redirect_stderr(log),
     ):
         print(f"process {os.getpid()} on {socket.gethostname()}")
+        wait_until_left(trial.folder)
+        check_folder(trial)
+        if trial.finished:
+            return 0
         learner = importlib.import_module(f"baselines.{trial.algorithm}")
         code: int = learner.main(parse_options(type(trial.options), "", trial.arguments))
     return code
+
+
+def wait_until_left(folder: Path) -> None:
+    """Wait until no process has the run folder open, or for LEFT_SECONDS."""
+    if folder.is_dir():
+        with contextlib.suppress(Timeout), FileLock(folder / LOCK_FILE, timeout=LEFT_SECONDS):
+            pass
 
 
 def start_ray(args: Args) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -11,8 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from baselines import compare
+from baselines.runs import LOCK_FILE
 from baselines.studies import MEASURES
 
 pytest.importorskip("ray")
@@ -48,6 +51,63 @@ def start(out: Path, home: Path, *words: str) -> Iterator["subprocess.Popen[str]
         finally:
             if study.poll() is None:
                 study.terminate()
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Start a Ray cluster of three nodes on this machine; return its address and two of them.
+
+    The head has no core, the two others have one each.
+    """
+    ray = Path(sys.executable).with_name("ray")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    head = ["--head", f"--port={address.split(':')[1]}", "--num-cpus=0", "--include-dashboard=0"]
+    worker = [f"--address={address}", "--num-cpus=1"]
+    common = ["--block", "--disable-usage-stats", "--node-ip-address=127.0.0.1"]
+    common += ["--object-store-memory=100000000"]
+    environment = {**os.environ, "HOME": str(tmp_path)}
+    nodes = []
+    try:
+        for words in (head, worker, worker):
+            nodes.append(
+                subprocess.Popen(
+                    [ray, "start", *words, *common],
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    start_new_session=True,
+                )
+            )
+            wait_for_node(nodes[-1])
+        yield address, nodes[1:]
+    finally:
+        for node in nodes:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(node.pid, signal.SIGKILL)
+            node.wait()
+            assert node.stdout is not None
+            node.stdout.close()
+
+
+def wait_for_node(node: "subprocess.Popen[str]") -> None:
+    """Wait until a node says that it runs."""
+    assert node.stdout is not None
+    for line in node.stdout:
+        if "Ray runtime started" in line:
+            return
+    raise AssertionError(f"a node of Ray has not started: exit code {node.poll()}")
+
+
+def ancestors(process: int) -> list[int]:
+    """Return the process that started `process`, the one that started that, and so on."""
+    found = []
+    while process > 1:
+        # The name in parentheses may hold spaces.
+        process = int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
+        found.append(process)
+    return found
 
 
 def process_in_the_middle(
@@ -87,15 +147,22 @@ def serial(tmp_path_factory):
 
 
 def test_killed_worker_changes_nothing(serial, tmp_path):
-    """After kill -9 of a worker in mid-training, weights and tables are those of compare.py."""
+    """After kill -9 of a worker in mid-training, weights and tables are those of compare.py.
+
+    Its lock on the run folder outlives it, as a lost machine's does.
+    """
     out = tmp_path / "study"
+    log = out / "default-meta-seed0.log"
     with start(out, tmp_path) as study:
         os.kill(process_in_the_middle(study, out / "default-meta-seed0"), signal.SIGKILL)
+        with FileLock(out / "default-meta-seed0" / LOCK_FILE, timeout=5):
+            while log.read_text().count("process ") < 2 and study.poll() is None:
+                time.sleep(0.1)
+            time.sleep(8)  # without waiting for the lock it would be tried by now
         printed, _ = study.communicate(timeout=500)
     assert study.returncode == 0, printed
-    log = (out / "default-meta-seed0.log").read_text()
-    assert log.count("process ") == 2
-    assert "going on from episode" in log
+    assert log.read_text().count("process ") == 2
+    assert "going on from episode" in log.read_text()
     for run in ("default-meta-seed0", "paper-meta-seed0"):
         for name in SAME:
             assert (out / run / name).read_bytes() == (serial / run / name).read_bytes()
@@ -128,3 +195,22 @@ def test_what_is_lost_too_often_is_reported(tmp_path):
     assert study.returncode == 1
     assert "error: these trainings failed: default-meta-seed0: " in printed
     assert not (out / "comparison.md").exists()
+
+
+def test_lost_node_changes_nothing(serial, cluster, tmp_path):
+    """A node of a cluster is lost in mid-training; another goes on with it, to the same bytes."""
+    out, (address, nodes) = tmp_path / "study", cluster
+    with start(out, tmp_path, "--address", address) as study:
+        process = process_in_the_middle(study, out / "default-meta-seed0")
+        lost = [node for node in nodes if node.pid in ancestors(process)]
+        assert len(lost) == 1
+        os.killpg(lost[0].pid, signal.SIGKILL)
+        os.kill(process, signal.SIGKILL)
+        printed, _ = study.communicate(timeout=500)
+    assert study.returncode == 0, printed
+    log = (out / "default-meta-seed0.log").read_text()
+    assert log.count("process ") == 2
+    for run in ("default-meta-seed0", "paper-meta-seed0"):
+        for name in SAME:
+            assert (out / run / name).read_bytes() == (serial / run / name).read_bytes()
+    assert untimed_csv(out / "comparison.csv") == untimed_csv(serial / "comparison.csv")
