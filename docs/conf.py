@@ -25,6 +25,7 @@ exclude_patterns = ["_build", PLAYGROUND]
 myst_heading_anchors = 4  # links such as solvers.md#files, as GitHub makes them
 
 autodoc_member_order = "bysource"
+autodoc_mock_imports = ["stable_baselines3", "supersuit"]  # what adapters adapt to is not needed
 autodoc_typehints = "none"  # docstrings say types, shapes and units
 napoleon_google_docstring = False
 napoleon_use_ivar = True
