@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -101,3 +101,31 @@ def same() -> Callable[[Any, Any], None]:
         assert difference is None, difference
 
     return check
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+BROWSER_OPTIONS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium without a window, by Playwright.
+
+    Where there is none the test is skipped; with MAPP_REQUIRE_CHROMIUM=1, as in continuous
+    integration, it fails.
+    """
+    from playwright.sync_api import sync_playwright
+
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        problem = f"no browser on the path: none of {', '.join(BROWSERS)}"
+        if os.environ.get("MAPP_REQUIRE_CHROMIUM"):
+            pytest.fail(problem)
+        pytest.skip(problem)
+    with sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=program, args=BROWSER_OPTIONS.split())
+        yield running
+        running.close()

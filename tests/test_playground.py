@@ -1,7 +1,6 @@
 """The page in docs/playground, in a browser without a window: it acts and counts as Python does.
 
-Where there is no Chromium these tests are skipped; with MAPP_REQUIRE_CHROMIUM=1, as in continuous
-integration, they fail.
+Where there is no Chromium these tests are skipped, as the fixture ``browser`` says.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from baselines.evaluation import evaluate
 from baselines.export_playground import PLAYGROUND, export
@@ -29,11 +28,6 @@ from mapp_env import Plan, Problem, make_grid, replay, sample_problems, solve
 GRID = make_grid()
 SETTING = Setting(GRID)
 FIRST = [0, 6, 20, 42, 48]  # what the page shows without a link
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-OPTIONS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run "
-    "--disable-background-networking --disable-component-update --disable-sync"
-)
 COSTS = ("cover_time", "makespan", "total_distance")
 
 # More, for a longer check of the page against the weights that it has: those rounded to 16 bits.
@@ -49,20 +43,6 @@ PLAY = """problems => problems.map(landmarks => Object.fromEntries(
 # The joint actions' values on observations (cells, landmarks, visited flags).
 VALUES = """rows => rows.map(([cells, landmarks, visited]) =>
     Array.from(mapp.network.values(cells, landmarks, visited.map(Boolean))))"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """Chromium, if there is one."""
-    program = next(filter(None, map(shutil.which, NAMES)), None)
-    if program is None:
-        if os.environ.get("MAPP_REQUIRE_CHROMIUM"):
-            pytest.fail(f"no browser on the path: none of {', '.join(NAMES)}")
-        pytest.skip(f"no browser on the path (none of {', '.join(NAMES)}): the page is not tested")
-    with sync_playwright() as driver:
-        running = driver.chromium.launch(executable_path=program, args=OPTIONS.split())
-        yield running
-        running.close()
 
 
 @pytest.fixture

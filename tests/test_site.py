@@ -10,6 +10,7 @@ import subprocess
 import sys
 from html import unescape
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,14 +37,21 @@ def build(docs: Path, site: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
-    """A page for every document, a docstring for every public name, and all pictures."""
-    docs, site = tmp_path / "docs", tmp_path / "site"
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the site without a warning; return its folder."""
+    folder = tmp_path_factory.mktemp("site")
+    docs, site = folder / "docs", folder / "site"
     shutil.copytree(DOCS, docs, ignore=shutil.ignore_patterns("_build"))
     for name in ("examples", "README.md", "CHANGELOG.md"):
-        (tmp_path / name).symlink_to(REPOSITORY / name)
+        (folder / name).symlink_to(REPOSITORY / name)
     done = build(docs, site)
     assert (done.returncode, done.stderr) == (0, "")
+    return site
+
+
+def test_site_is_built_without_a_warning(site: Path) -> None:
+    """A page for every document, a docstring for every public name, and all pictures."""
     for page in DOCS.glob("*.md"):
         assert (site / f"{page.stem}.html").is_file(), page.name
     reference = (site / "api.html").read_text(encoding="utf-8")
@@ -61,6 +69,16 @@ def test_site_is_built_without_a_warning(tmp_path: Path) -> None:
     links = re.findall(r'href="\.\./([^"#]+)', playground)
     assert links
     assert all((site / link).is_file() for link in links), links
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_pages_keep_to_the_window(site: Path, browser: Any, width: int) -> None:
+    """Nothing makes a page wider than the window, on a phone or beside a table of contents."""
+    page = browser.new_page(viewport={"width": width, "height": 800})
+    for path in sorted(site.glob("*.html")):
+        page.goto(path.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, path.name
+    page.close()
 
 
 def test_a_broken_link_is_an_error(tmp_path: Path) -> None:
