@@ -7,7 +7,9 @@
 Every training is a Ray task with one core, in a process of its own. A worker that is lost (killed,
 out of memory, its machine gone) is started again by Ray, up to ``--max-retries`` times, and its
 training goes on from the last checkpoint in its run folder, to the same bytes as if nothing had
-been. So OUT has to be a folder that all machines see under the same path, and this checkout too.
+been. (How often one that was out of memory is started again, a cluster decides where it is started:
+RAY_task_oom_retries, without end if it is not set.) OUT has to be a folder that all machines see
+under the same path, and so have this checkout and the working directory if an option names a file.
 
 Output: OUT/comparison.md, .csv and .png as ``python baselines/compare.py`` writes them, equal but
 for the minutes, and the run folder and log of each training. The same command, or compare.py's,
@@ -61,8 +63,10 @@ class Args(compare.Args):
         check_count("max_retries", self.max_retries, 0, 1000)
 
 
-def train(trial: Trial) -> int:
+def train(trial: Trial, directory: Path) -> int:
     """Train in this process, or go on with what a lost one has left; return the exit code.
+
+    Files that options name are looked for from `directory`.
 
     Raises
     ------
@@ -76,6 +80,7 @@ def train(trial: Trial) -> int:
         contextlib.redirect_stderr(log),
     ):
         print(f"process {os.getpid()} on {socket.gethostname()}")
+        os.chdir(directory)
         wait_until_left(trial.folder)
         check_folder(trial)
         if trial.finished:
@@ -98,6 +103,7 @@ def start_ray(args: Args) -> None:
         "num_cpus": args.jobs,
         "object_store_memory": OBJECT_STORE_BYTES,
         "include_dashboard": False,
+        "_system_config": {"task_oom_retries": args.max_retries},
     }
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
@@ -117,7 +123,7 @@ def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -
         print(f"{done} of {len(trials)} trainings were finished already")
     # One call a process: nothing is left over from the training before.
     task = ray.remote(num_cpus=1, max_calls=1, max_retries=max_retries)(train)
-    running = {task.remote(trial): trial for trial in waiting}
+    running = {task.remote(trial, Path.cwd()): trial for trial in waiting}
     failures: list[str] = []
     told = False
     while running:

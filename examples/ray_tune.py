@@ -68,7 +68,7 @@ class Args:
     problems: int = 500
     """problems held out for tuning"""
     jobs: int = 2
-    """trials at a time"""
+    """trials at a time; on a cluster as well"""
     seed: int = 0
     """seed of the settings that are tried, and of every training"""
     address: str | None = None
@@ -171,6 +171,7 @@ def search(args: Args) -> "tune.ResultGrid":
             metric=METRIC,
             mode="min",
             num_samples=args.trials,
+            max_concurrent_trials=args.jobs,
             search_alg=BasicVariantGenerator(
                 points_to_evaluate=[preset_point(space, args.states)], random_state=args.seed
             ),
@@ -192,8 +193,18 @@ def search(args: Args) -> "tune.ResultGrid":
 
 
 def print_trials(results: "tune.ResultGrid") -> None:
-    """Print a Markdown table, a row for each trial, the best first."""
+    """Print a Markdown table, a row for each trial, the best first.
+
+    Raises
+    ------
+    ValueError
+        If all have failed.
+    """
     ended = [result for result in results if result.error is None]
+    for error in results.errors:
+        print(f"failed: {error}")
+    if not ended:
+        raise ValueError("all trials have failed")
     ended.sort(key=lambda result: result.metrics[METRIC])
     names = list(ended[0].config)
     figures = [METRIC, "solved %", "problems", "CPU seconds"]
@@ -204,8 +215,6 @@ def print_trials(results: "tune.ResultGrid") -> None:
         cells += [f"{result.metrics[name]:.1f}" for name in figures[:2]]
         cells += [f"{result.metrics[name]:.0f}" for name in figures[2:]]
         print("| " + " | ".join(cells) + " |")
-    for error in results.errors:
-        print(f"failed: {error}")
 
 
 def final_figures(args: Args, result: "tune.Result") -> str:
@@ -227,7 +236,8 @@ def start_ray(args: Args) -> None:
         "object_store_memory": 200_000_000,
         "include_dashboard": False,
     }
-    variables = {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     ray.init(
         args.address or "local",
         log_to_driver=False,
@@ -255,13 +265,17 @@ def main(args: Args) -> None:
     )
     print(f"\n{len(results)} trials in {time.monotonic() - started:.0f} s")
     print(f"best, 1,000 other problems: {final_figures(args, best)}")
-    print(
-        f"the preset's own settings: {final_figures(args, first)}, {first.metrics['problems']} "
-        "training problems"
-    )
-    words = [f"--{k.replace('_', '-')} {v:.4g}" for k, v in best.config.items()]
+    if first.error is None:
+        print(
+            f"the preset's own settings: {final_figures(args, first)}, "
+            f"{first.metrics['problems']} training problems"
+        )
+    words = [f"--{name.replace('_', '-')} {value}" for name, value in best.config.items()]
     batch_size = args.states // best.config["updates_per_episode"]
-    print(f"python baselines/meta_dqn.py {' '.join(words)} --batch-size {batch_size}")
+    print(
+        f"python baselines/meta_dqn.py --seed {args.seed} {' '.join(words)} "
+        f"--batch-size {batch_size}"
+    )
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -151,15 +150,21 @@ def for_replay(played: TensorDictBase, env: PettingZooWrapper, args: Args) -> Te
     return kept
 
 
-def episode_returns(played: TensorDictBase) -> Iterator[float]:
-    """Yield the returns of the episodes that ended, from consecutive steps."""
-    total = 0.0
-    rewards = played["next", "agent", "reward"][:, 0, 0].tolist()
-    for reward, done in zip(rewards, played["next", "done"][:, 0].tolist(), strict=True):
-        total += reward
-        if done:
-            yield total
-            total = 0.0
+class Returns:
+    """Sums rewards, step by step, up to the returns of episodes."""
+
+    def __init__(self) -> None:
+        self.total = 0.0  # of the episode in progress
+        self.ended: list[float] = []
+
+    def add(self, played: TensorDictBase) -> None:
+        """Add steps that follow those before."""
+        rewards = played["next", "agent", "reward"][:, 0, 0].tolist()
+        for reward, done in zip(rewards, played["next", "done"][:, 0].tolist(), strict=True):
+            self.total += reward
+            if done:
+                self.ended.append(self.total)
+                self.total = 0.0
 
 
 def judge_actor(actor: QValueActor, landmarks: np.ndarray, args: Args) -> Judgement:
@@ -199,9 +204,9 @@ def train(env: PettingZooWrapper, actor: QValueActor, args: Args) -> TensorDictR
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(args.steps + args.steps_per_batch), batch_size=args.batch_size
     )
-    recent, start, reported = [], time.process_time(), 0
+    returns, start, reported = Returns(), time.process_time(), 0
     for played in collector:
-        recent.append(played.select(("next", "agent", "reward"), ("next", "done")).clone())
+        returns.add(played)
         replay.extend(for_replay(played, env, args))
         explorer.step(args.steps_per_batch)
         for _ in range(args.updates_per_batch):
@@ -211,14 +216,13 @@ def train(env: PettingZooWrapper, actor: QValueActor, args: Args) -> TensorDictR
             targets.step()
         if len(replay) // 1000 > reported:
             reported = len(replay) // 1000
-            returns = list(episode_returns(torch.cat(recent)))
             seconds = time.process_time() - start
             print(
-                f"{len(replay):6d} steps {seconds:4.0f} s: return of the last {len(returns)} "
-                f"episodes {np.mean(returns):.1f}",
+                f"{len(replay):6d} steps {seconds:4.0f} s: return of the last "
+                f"{len(returns.ended)} episodes {np.mean(returns.ended):.1f}",
                 flush=True,
             )
-            recent.clear()
+            returns.ended.clear()
     collector.shutdown(close_env=False)
     return replay
 

@@ -19,7 +19,13 @@ from mapp_env.simulation import Simulation
 from mapp_env.task import RENDER_MODES, Task, find_grid
 from mapp_env.validation import MAX_SEED, as_integer, check_choice, check_count, describe
 
-__all__ = ["CENTRAL_ACTIONS", "MAX_JOINT_AGENTS", "CentralEnv", "central_action_space"]
+__all__ = [
+    "CENTRAL_ACTIONS",
+    "MAX_JOINT_AGENTS",
+    "CentralEnv",
+    "central_action_masks",
+    "central_action_space",
+]
 
 CENTRAL_ACTIONS = ("auto", "joint", "multi")
 
@@ -61,6 +67,31 @@ def central_action_space(
         return MultiDiscrete(np.full(n_agents, n_actions)), None
     table = np.indices((n_actions,) * n_agents).reshape(n_agents, -1).T
     return Discrete(n_actions**n_agents), np.ascontiguousarray(table, np.int64)
+
+
+def central_action_masks(
+    masks: NDArray[np.int8], joint_actions: NDArray[np.int64] | None
+) -> NDArray[np.bool_]:
+    """Return which of the meta-agent's actions bump no agent.
+
+    Parameters
+    ----------
+    masks : ndarray of int8, shape (B, N, A)
+        The agents' action masks.
+    joint_actions : ndarray of int64, shape (A**N, N), or None
+        What :func:`central_action_space` returns.
+
+    Returns
+    -------
+    ndarray of bool, shape (B, A**N) or, without numbered joint actions, (B, N * A)
+        Of every joint action, or of each agent's actions one agent after the other.
+    """
+    allowed = masks.astype(np.bool_)
+    if joint_actions is None:
+        return allowed.reshape(len(allowed), -1)
+    agents = np.arange(joint_actions.shape[1])
+    every: NDArray[np.bool_] = np.all(allowed[:, agents, joint_actions], axis=-1)
+    return every
 
 
 class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
@@ -159,6 +190,24 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         if self.render_mode == "human":
             self.render()
         return self._seen(views), reward, terminated, truncated, info
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns
+        -------
+        ndarray of bool, shape (A**N,) or, with ``MultiDiscrete`` actions, (N * A,)
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("action_masks() needs an episode: call reset() first")
+        _, masks = self._simulation.observe()
+        found: NDArray[np.bool_] = central_action_masks(masks[None], self._joint_actions)[0]
+        return found
 
     def _read_action(self, action: Any) -> NDArray[np.int64]:
         """Return each agent's action, shape (N,)."""

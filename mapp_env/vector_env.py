@@ -63,6 +63,11 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
         As in :class:`mapp_env.parallel_env.MappParallelEnv`.
 
+    Attributes
+    ----------
+    joint_actions : ndarray of int64, shape (A**N, N), or None
+        Each agent's action for each numbered joint action.
+
     Raises
     ------
     ValueError
@@ -107,7 +112,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         view = task.central_view
         self.single_observation_space = Box(view.low, view.high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.single_action_space, self._joint_actions = central_action_space(task, central_action)
+        self.single_action_space, self.joint_actions = central_action_space(task, central_action)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         n_views = 1 if task.observation_kind == Observation.GLOBAL else task.n_agents
@@ -278,7 +283,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
 
     def _read_actions(self, actions: Any) -> NDArray[np.int64]:
         """Return each agent's action in each row, shape (B, N)."""
-        joint = self._joint_actions is not None
+        joint = self.joint_actions is not None
         shape = (self.num_envs,) if joint else (self.num_envs, self.task.n_agents)
         try:
             array = np.asarray(actions)
@@ -289,7 +294,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"actions must be integers of shape {shape}, "
                 f"got shape {array.shape} and dtype {array.dtype}"
             )
-        n_actions = self.task.n_actions if self._joint_actions is None else len(self._joint_actions)
+        n_actions = self.task.n_actions if self.joint_actions is None else len(self.joint_actions)
         array = np.ascontiguousarray(array, np.int64)
         bad = find_bad_action(array.reshape(-1).view(np.uint64), n_actions)
         if bad >= 0:
@@ -298,7 +303,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"actions[{place}] must be in 0..{n_actions - 1}, "
                 f"got {np.asarray(actions).flat[bad]}"
             )
-        return array if self._joint_actions is None else self._joint_actions[array]
+        return array if self.joint_actions is None else self.joint_actions[array]
 
     def _check_reset_mask(self, options: Mapping[str, Any] | None) -> NDArray[np.bool_]:
         """Return which rows to reset, shape (B,), the caller's array untouched."""

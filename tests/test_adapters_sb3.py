@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
+import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -24,6 +27,7 @@ with warnings.catch_warnings():  # SuperSuit's own imports warn
 
 from stable_baselines3 import DQN, PPO  # noqa: E402
 from stable_baselines3.common.env_checker import check_env  # noqa: E402
+from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 from stable_baselines3.common.vec_env import (  # noqa: E402
     DummyVecEnv,
     VecMonitor,
@@ -90,7 +94,8 @@ def test_engine_counts_episodes_as_monitor_does() -> None:
     envs.seed(1)
     twin = make_sb3_vec(6, n_landmarks=2, max_cycles=12)
     twin.seed(1)
-    monitor = VecMonitor(twin)  # puts its own "episode" in the place of the engine's
+    with pytest.warns(UserWarning, match="overwritten"):
+        monitor = VecMonitor(twin)  # puts its own "episode" in the place of the engine's
     envs.reset()
     monitor.reset()
     rng, count = np.random.default_rng(3), 0
@@ -141,8 +146,12 @@ def test_engine_takes_problems() -> None:
     envs.seed(0)
     landmarks = np.array([[0, 1, 2], [42, 43, 44]])
     envs.set_options({"landmarks": landmarks})
-    assert envs.reset()[:, 3:6].tolist() == landmarks.tolist()
-    assert envs.reset()[:, 3:6].tolist() != landmarks.tolist()
+    kept = landmarks.copy()
+    landmarks[:] = 7  # what was given is the caller's
+    assert envs.reset()[:, 3:6].tolist() == kept.tolist()
+    assert envs.reset()[:, 3:6].tolist() != kept.tolist()
+    envs.set_options([{"landmarks": [0, (0, 1), 2]}, {"landmarks": kept[1]}])
+    assert envs.reset()[:, 3:6].tolist() == kept.tolist()
 
 
 def test_engine_keeps_nothing_of_what_it_gives() -> None:
@@ -156,6 +165,12 @@ def test_engine_keeps_nothing_of_what_it_gives() -> None:
     assert (observations[:, 3:8] == kept[:, 3:8]).all()
     with pytest.raises(TypeError):
         infos[0]["mark"] = 1
+    with pytest.raises(TypeError):
+        infos[0].update(mark=1)
+    for copied in (infos[0].copy(), copy.copy(infos[0]), copy.deepcopy(infos)[0]):
+        copied["mark"] = 1
+    assert pickle.loads(pickle.dumps(infos)) == [{}, {}]
+    assert infos == [{}, {}]
 
 
 def test_engine_shows_its_rows() -> None:
@@ -247,6 +262,134 @@ def test_clock_stops_a_training() -> None:
     model.learn(10_000, callback=watch)
     assert model.num_timesteps == 2
     assert watch.elapsed >= 0.0
+    watch.seconds = 1000.0
+    model.learn(40, callback=watch)  # the clock begins anew
+    assert model.num_timesteps >= 40
+
+
+FORMS: dict[str, Callable[[], Any]] = {
+    "multi": lambda: make_sb3_vec(3, n_landmarks=2, max_cycles=12),
+    "joint": lambda: make_sb3_vec(3, central_action="joint", n_landmarks=2, max_cycles=12),
+    "shared": lambda: make_sb3_shared(2, n_landmarks=2, max_cycles=12),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_masks_say_what_bumps(form: str) -> None:
+    """An action is masked if and only if a copy of the row that takes it leaves an agent behind."""
+    envs = FORMS[form]()
+    envs.seed(2)
+    envs.reset()
+    rng = np.random.default_rng(0)
+    moves = mapp_v0.parallel_env().task.grid.moves
+    for _ in range(30):
+        masks = np.stack(envs.env_method("action_masks"))
+        assert masks.dtype == bool
+        assert np.array_equal(masks, envs.action_masks())
+        assert np.array_equal(envs.get_attr("action_masks", indices=1)[0](), masks[1])
+        if form == "shared":
+            cells = np.array([env.par_env.state()[:3] for env in envs.venv.vec_envs], int)
+            expected = (moves[cells] != cells[..., None]).reshape(6, 4)
+        else:
+            cells = last_cells(envs)
+            free = moves[cells] != cells[..., None]  # (B, N, A)
+            if form == "multi":
+                expected = free.reshape(3, 12)
+            else:
+                every = np.array(list(itertools.product(range(4), repeat=3)))
+                expected = np.array([[row[[0, 1, 2], j].all() for j in every] for row in free])
+        assert np.array_equal(masks, expected)
+        envs.step(batched_actions(envs, rng))
+
+
+def last_cells(envs: MappSb3VecEnv) -> np.ndarray:
+    """Return the agents' cells in every row, shape (B, N)."""
+    return np.array([envs.engine._rows.scene(row).cells for row in range(envs.num_envs)])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_maskable_ppo_never_bumps(form: str) -> None:
+    """sb3-contrib's MaskablePPO finds the masks, learns with them, and takes no masked action."""
+    sb3_contrib = pytest.importorskip("sb3_contrib")
+    envs = FORMS[form]()
+    model = sb3_contrib.MaskablePPO(
+        "MlpPolicy", envs, n_steps=16, batch_size=24, n_epochs=1, seed=0, device="cpu"
+    )
+    model.learn(100)
+    observations = envs.reset()
+    for _ in range(30):
+        masks = np.stack(envs.env_method("action_masks"))
+        actions, _ = model.predict(observations, action_masks=masks)
+        if form == "multi":
+            chosen = masks.reshape(3, 3, 4)[np.arange(3)[:, None], np.arange(3), actions]
+        else:
+            chosen = masks[np.arange(len(actions)), actions]
+        assert chosen.all()
+        observations = envs.step(actions)[0]
+
+
+def test_central_environment_has_masks() -> None:
+    """CentralEnv.action_masks says the same as the batch's, and asks for a reset first."""
+    for central_action in ("multi", "joint"):
+        env = CentralEnv(central_action=central_action)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.action_masks()
+        envs = make_sb3_vec(1, central_action=central_action)
+        env.reset(seed=envs.seed(3)[0])
+        envs.reset()
+        rng = np.random.default_rng(1)
+        for _ in range(20):
+            assert np.array_equal(env.action_masks(), envs.action_masks()[0])
+            actions = batched_actions(envs, rng)
+            env.step(actions[0])
+            envs.step(actions)
+
+
+def test_evaluations_read_the_episodes() -> None:
+    """evaluate_policy gives returns of the task's own reward, whatever VecNormalize does to it."""
+    envs = make_sb3_vec(4, n_landmarks=2, max_cycles=12)
+    model = PPO("MlpPolicy", envs, n_steps=16, batch_size=32, seed=0, device="cpu")
+    returns, lengths = evaluate_policy(
+        model, VecNormalize(envs), n_eval_episodes=8, return_episode_rewards=True
+    )
+    assert all(total == round(total) for total in returns)
+    assert max(lengths) <= 12
+    assert len(returns) == 8
+
+
+@pytest.mark.parametrize("form", ["multi", "shared"])
+def test_success_is_logged(form: str) -> None:
+    """Ended rows say is_success, from which SB3 makes its success rate."""
+    envs = FORMS[form]()
+    envs.seed(0)
+    envs.reset()
+    rng, seen = np.random.default_rng(0), set()
+    for _ in range(150):
+        _, _, dones, infos = envs.step(batched_actions(envs, rng))
+        for row, info in enumerate(infos):
+            assert ("is_success" in info) == dones[row]
+            if dones[row]:
+                assert info["is_success"] is not info["TimeLimit.truncated"]
+                seen.add(info["is_success"])
+    assert seen == {False, True}
+
+
+def test_shared_environments_take_problems() -> None:
+    """set_options gives the landmarks to the next reset of all environments, and to that alone."""
+    envs = make_sb3_shared(2, n_landmarks=3)
+    envs.seed(0)
+    envs.set_options({"landmarks": [0, 1, 42]})
+    assert (envs.reset()[:, 3:6] == [0, 1, 42]).all()
+    assert not (envs.reset()[:, 3:6] == [0, 1, 42]).all()
+    assert (envs.reset()[:, :3] == envs.reset()[0, :3]).all()
+
+
+def test_agents_that_share_a_network_see_who_they_are() -> None:
+    """Without a word on observations the agents of a team see different things once they part."""
+    envs = make_sb3_shared(1)
+    envs.reset()
+    seen = envs.step(np.array([0, 1, 2]))[0]
+    assert len(np.unique(seen, axis=0)) == 3
 
 
 @pytest.mark.parametrize(
@@ -255,12 +398,15 @@ def test_clock_stops_a_training() -> None:
         (lambda: make_sb3_vec(2, autoreset_mode="NextStep"), "autoreset_mode"),
         (lambda: make_sb3_vec(0), "num_envs"),
         (lambda: make_sb3_vec(2).set_options([{}, {}]), "options"),
+        (lambda: make_sb3_vec(2).set_options([{"landmarks": [0, 1, 2, 3, 5]}]), "options"),
+        (lambda: make_sb3_vec(2).set_options({"reset_mask": np.ones(2, bool)}), "reset_mask"),
+        (lambda: make_sb3_vec(2, render_mode="ansi"), "render_mode"),
+        (lambda: make_sb3_shared(2).set_options([{}, {}]), "options"),
         (lambda: make_sb3_vec(2).set_attr("max_cycles", 3), "max_cycles"),
         (lambda: make_sb3_vec(2).env_method("state"), "state"),
         (lambda: make_sb3_vec(2).seed(-1), "seed"),
         (lambda: make_sb3_shared(2).seed(-1), "seed"),
         (lambda: make_sb3_shared(0), "num_envs"),
-        (lambda: make_sb3_shared(1, num_cpus=2), "num_cpus"),
         (lambda: make_sb3_shared(1, render_mode="ansi"), "render_mode"),
         (lambda: SharedVecEnv(make_sb3_shared(1).venv, 2), "n_agents"),
         (lambda: make_sb3_shared(1).set_attr("max_cycles", 3), "max_cycles"),

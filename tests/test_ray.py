@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -23,7 +24,9 @@ pytest.importorskip("ray")
 # On a busy machine Ray alone takes minutes to start.
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "ray_seeds.py"
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPT = ROOT / "examples" / "ray_seeds.py"
+MAP = ROOT / "mapp_env" / "grids" / "paper-7x7.txt"
 GRID = {"presets": ("default", "paper"), "learners": ("meta",), "seeds": 1, "default_updates": 4}
 WORDS = [
     *("--n-problems", "2", "--episodes-per-problem", "8", "--max-cycles", "12"),
@@ -44,7 +47,12 @@ def start(out: Path, home: Path, *words: str) -> Iterator["subprocess.Popen[str]
     # Ray keeps a token in the home folder.
     environment = {**os.environ, "HOME": str(home), "RAY_USAGE_STATS_ENABLED": "0"}
     with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command,
+        cwd=home,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
     ) as study:
         try:
             yield study
@@ -198,9 +206,13 @@ def test_what_is_lost_too_often_is_reported(tmp_path):
 
 
 def test_lost_node_changes_nothing(serial, cluster, tmp_path):
-    """A node of a cluster is lost in mid-training; another goes on with it, to the same bytes."""
+    """A node of a cluster is lost in mid-training; another goes on with it, to the same bytes.
+
+    Workers find a map file that is named from where the study was started.
+    """
     out, (address, nodes) = tmp_path / "study", cluster
-    with start(out, tmp_path, "--address", address) as study:
+    shutil.copy(MAP, tmp_path / "here.txt")
+    with start(out, tmp_path, "--address", address, "--grid", "here.txt") as study:
         process = process_in_the_middle(study, out / "default-meta-seed0")
         lost = [node for node in nodes if node.pid in ancestors(process)]
         assert len(lost) == 1

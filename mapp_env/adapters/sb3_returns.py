@@ -11,7 +11,7 @@ __all__ = ["EpisodeReturns"]
 
 
 class EpisodeReturns(BaseCallback):
-    """Keep every episode's return, and stop the training after some CPU seconds.
+    """Keep every episode's return, and stop each call of ``learn`` after some CPU seconds.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class EpisodeReturns(BaseCallback):
         ``infos[i]["episode"]``: ``make_sb3_vec`` has it, others get it from ``Monitor`` or
         ``VecMonitor``.
     elapsed : float
-        CPU seconds since the first step.
+        CPU seconds since the first step of the last call.
     """
 
     def __init__(self, seconds: float = float("inf")) -> None:
@@ -36,6 +36,9 @@ class EpisodeReturns(BaseCallback):
         self.returns: list[float] = []
         self.elapsed = 0.0
         self._started: float | None = None
+
+    def _on_training_start(self) -> None:
+        self._started = None
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]

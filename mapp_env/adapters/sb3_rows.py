@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from functools import partial
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 __all__ = ["RowsVecEnv"]
+
+MASKS = "action_masks"
+"""The one method that can be called by row: sb3-contrib's ``MaskablePPO`` does."""
 
 
 class RowsVecEnv(VecEnv):
@@ -25,10 +32,23 @@ class RowsVecEnv(VecEnv):
     def __init__(self, batch: Any, name: str, observation_space: Any, action_space: Any) -> None:
         self._batch, self._name = batch, name
         super().__init__(batch.num_envs, observation_space, action_space)
+        # For recorders of films, which take 30 a second where nothing is said.
+        self.metadata = {**self.metadata, "render_fps": batch.metadata["render_fps"]}
+
+    @abstractmethod
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions do not bump in each row, shape (B, ...)."""
+
+    def _mask_of(self, row: int) -> NDArray[np.bool_]:
+        mask: NDArray[np.bool_] = self.action_masks()[row]
+        return mask
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return the batch's attribute once for each row asked for."""
-        return [getattr(self._batch, attr_name)] * len(list(self._get_indices(indices)))
+        rows = list(self._get_indices(indices))
+        if attr_name == MASKS:
+            return [partial(self._mask_of, row) for row in rows]
+        return [getattr(self._batch, attr_name)] * len(rows)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refuse: rows have no attributes of their own.
@@ -43,13 +63,15 @@ class RowsVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Refuse: rows have no methods of their own.
+        """Return :meth:`action_masks` by row; refuse all else, as rows have no other methods.
 
         Raises
         ------
         ValueError
-            Always.
+            If ``method_name`` is not ``"action_masks"``.
         """
+        if method_name == MASKS:
+            return list(self.action_masks()[list(self._get_indices(indices))])
         raise ValueError(f"{method_name}() cannot be called by row: call it on .{self._name}")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
 import numpy as np
 import supersuit
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
@@ -22,14 +24,16 @@ class SharedVecEnv(RowsVecEnv):
     """A view of SuperSuit's vector environment in which seeds and time-outs arrive.
 
     Row ``i * N + a`` is agent ``a`` of environment ``i``: one network that commands every row by
-    itself is shared by all agents. Each ended row's info holds ``terminal_observation``; each
-    info says by ``TimeLimit.truncated`` whether the step limit has ended the row, which SuperSuit's
-    own wrapper for Stable-Baselines3 leaves out (and it fails when it is seeded).
+    itself is shared by all agents. Each ended row's info holds ``terminal_observation`` and
+    ``is_success``; each info says by ``TimeLimit.truncated`` whether the step limit has ended the
+    row, which SuperSuit's own wrapper for Stable-Baselines3 leaves out (and it fails when it is
+    seeded).
 
     Parameters
     ----------
     venv : gymnasium.vector.VectorEnv
-        What ``supersuit.concat_vec_envs_v1(..., base_class="gymnasium")`` returns.
+        What ``supersuit.concat_vec_envs_v1(..., base_class="gymnasium")`` returns, of this
+        process alone: SuperSuit's worker processes seed some environments alike.
     n_agents : int
         Agents N of each environment.
 
@@ -47,6 +51,8 @@ class SharedVecEnv(RowsVecEnv):
         self.venv = venv
         self.n_agents = n_agents
         self._seed: int | None = None
+        self._wishes: dict[str, Any] | None = None
+        self._infos: list[dict[str, Any]] = []
         self._actions: Any = None
         super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
@@ -71,13 +77,38 @@ class SharedVecEnv(RowsVecEnv):
         self._seed = int(np.random.SeedSequence(seed).generate_state(1)[0])
         return [self._seed + row // self.n_agents for row in range(self.num_envs)]
 
+    def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
+        """Set the options of the next :meth:`reset`, for all environments alike.
+
+        Parameters
+        ----------
+        options : dict, optional
+            ``"landmarks"`` or ``"problem"``, as in the PettingZoo face.
+
+        Raises
+        ------
+        ValueError
+            If it is a list: rows are agents, and SuperSuit takes one dict for all environments.
+        """
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(
+                f"options must be one dict for all environments, got {describe(options)}"
+            )
+        self._wishes = None if options is None else deepcopy(dict(options))
+
     def reset(self) -> NDArray[np.float32]:
-        """Start an episode in every environment; return the observations, shape (B, ...)."""
+        """Start an episode in every environment; return the observations, shape (B, ...).
+
+        Raises
+        ------
+        ValueError
+            If the options cannot be used.
+        """
         # SuperSuit gives infos as a list, where Gymnasium has a dict of arrays.
         found: Any
-        observations, found = self.venv.reset(seed=self._seed)
-        self._seed = None
-        self.reset_infos = list(found)
+        observations, found = self.venv.reset(seed=self._seed, options=self._wishes)
+        self._seed, self._wishes = None, None
+        self._infos = self.reset_infos = list(found)
         return np.array(observations)
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
@@ -102,21 +133,39 @@ class SharedVecEnv(RowsVecEnv):
             {**info, "TimeLimit.truncated": late}
             for info, late in zip(found, (truncations & ~terminations).tolist(), strict=True)
         ]
-        return np.array(observations), np.array(rewards), terminations | truncations, infos
+        dones = terminations | truncations
+        for row in np.flatnonzero(dones).tolist():
+            infos[row]["is_success"] = bool(terminations[row])
+        self._infos = infos
+        return np.array(observations), np.array(rewards), dones, infos
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions do not bump, as sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns
+        -------
+        ndarray of bool, shape (B, A)
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first reset.
+        """
+        if not self._infos:
+            raise ResetNeeded("action_masks() needs episodes: call reset() first")
+        return np.stack([info["action_mask"] for info in self._infos]).astype(np.bool_)
 
 
-def make_sb3_shared(num_envs: int, num_cpus: int = 0, **arguments: Any) -> SharedVecEnv:
+def make_sb3_shared(num_envs: int, **arguments: Any) -> SharedVecEnv:
     """Return ``num_envs`` environments whose agents one Stable-Baselines3 policy commands singly.
 
     Parameters
     ----------
     num_envs : int
         Number of environments, each with N agents: the ``VecEnv`` has ``num_envs * N`` rows.
-    num_cpus : int
-        Worker processes of SuperSuit, 0 for none: a step is cheap, processes seldom pay.
     **arguments
-        Those of :class:`mapp_env.parallel_env.MappParallelEnv`. Agents that start on one cell
-        need to see who they are: ``observation="geodesic"`` or ``"own_first"``, not ``"global"``.
+        Those of :class:`mapp_env.parallel_env.MappParallelEnv`, but that ``observation`` is
+        ``"own_first"`` if it is not given: with ``"global"`` all agents see, and so do, the same.
 
     Raises
     ------
@@ -130,14 +179,14 @@ def make_sb3_shared(num_envs: int, num_cpus: int = 0, **arguments: Any) -> Share
     >>> model = PPO("MlpPolicy", make_sb3_shared(16, observation="geodesic"), seed=0)
     """
     check_count("num_envs", num_envs, 1, MAX_ENVS)
-    check_count("num_cpus", num_cpus, 0, num_envs)
     if arguments.get("render_mode") is not None:
         raise ValueError(
             "render_mode must be None: rows are agents, not pictures; "
             f"got {describe(arguments['render_mode'])}"
         )
-    env = MappParallelEnv(**arguments)
+    env = MappParallelEnv(**{"observation": "own_first", **arguments})
+    # In this process: SuperSuit's workers seed environments alike, and a step is cheap.
     venv = supersuit.concat_vec_envs_v1(
-        supersuit.pettingzoo_env_to_vec_env_v1(env), num_envs, num_cpus, base_class="gymnasium"
+        supersuit.pettingzoo_env_to_vec_env_v1(env), num_envs, base_class="gymnasium"
     )
     return SharedVecEnv(venv, len(env.possible_agents))

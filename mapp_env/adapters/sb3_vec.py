@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import Any
+from copy import deepcopy
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
+from mapp_env.central_env import central_action_masks
 from mapp_env.row_seeds import spread_seed
 from mapp_env.validation import MAX_SEED, check_count, describe
 from mapp_env.vector_env import MappVectorEnv
@@ -18,7 +20,25 @@ from mapp_env.vector_infos import Transition
 
 __all__ = ["MappSb3VecEnv", "make_sb3_vec"]
 
-NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+class SharedInfo(dict[str, Any]):
+    """An empty dict that stays so; its copies are ordinary ones."""
+
+    def _refuse(self, *_arguments: Any, **_more: Any) -> NoReturn:
+        raise TypeError("rows whose episodes go on share this info: copy it to write into it")
+
+    __setitem__ = __ior__ = setdefault = update = _refuse
+
+    def __deepcopy__(self, _memo: Any) -> dict[str, Any]:
+        """Return an ordinary dict."""
+        return {}
+
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        """Be pickled, and shallowly copied, as an ordinary dict."""
+        return dict, ()
+
+
+NOTHING = SharedInfo()
 """The info of a row whose episode goes on. One for all: a dict a row would take half a step."""
 
 
@@ -29,10 +49,12 @@ class MappSb3VecEnv(RowsVecEnv):
 
     - ``terminal_observation``: what was seen last;
     - ``TimeLimit.truncated``: whether the step limit ended it, so that its value is bootstrapped;
+    - ``is_success``: whether all landmarks were visited, for the logged success rate;
     - ``metrics``: success, cover_time, makespan and total_distance;
     - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them.
 
-    Infos of the other rows are empty and read-only.
+    Infos of the other rows are one empty dict that cannot be written into. Action masks are
+    :meth:`action_masks`.
 
     Parameters
     ----------
@@ -41,7 +63,7 @@ class MappSb3VecEnv(RowsVecEnv):
     **arguments
         Those of :class:`mapp_env.vector_env.MappVectorEnv` but ``autoreset_mode``:
         ``central_action="multi"`` (the default) gives ``MultiDiscrete`` actions, ``"joint"``
-        numbered ones, which DQN needs.
+        numbered ones, which DQN needs. ``render_mode`` is ``"rgb_array"`` or None.
 
     Attributes
     ----------
@@ -60,10 +82,17 @@ class MappSb3VecEnv(RowsVecEnv):
                 "autoreset_mode cannot be chosen: Stable-Baselines3 needs the same-step mode; "
                 f"got {describe(arguments['autoreset_mode'])}"
             )
+        if arguments.get("render_mode") not in (None, "rgb_array"):
+            raise ValueError(
+                "render_mode must be 'rgb_array' or None: rows are shown side by side; "
+                f"got {describe(arguments['render_mode'])}"
+            )
         self.engine = MappVectorEnv(num_envs, autoreset_mode="SameStep", **arguments)
         self._seed: int | None = None
         self._wishes: dict[str, Any] = {}
         self._actions: Any = None
+        task = self.engine.task
+        self._masks = np.zeros((num_envs, task.n_agents, task.n_actions), np.int8)
         self._returns = np.zeros(self.engine.num_envs)
         self._lengths = np.zeros(self.engine.num_envs, np.int64)
         self._started = time.perf_counter()
@@ -95,25 +124,36 @@ class MappSb3VecEnv(RowsVecEnv):
         return spread_seed(self._seed, self.num_envs)
 
     def set_options(self, options: list[dict[str, Any]] | dict[str, Any] | None = None) -> None:
-        """Set the options of the next :meth:`reset`, as the engine takes them.
+        """Set the options of the next :meth:`reset`.
 
         Parameters
         ----------
-        options : dict, optional
+        options : dict or list of dict, optional
             ``"landmarks"`` or ``"problem"`` for all rows alike, or the landmarks of each row as
-            cells, shape (B, K).
+            cells, shape (B, K). A list has a dict for each row, all with ``"landmarks"``.
 
         Raises
         ------
         ValueError
-            If it is a list: the engine takes one dict for all rows.
+            If it is none of these.
         """
-        if options is not None and not isinstance(options, Mapping):
+        if options is None or isinstance(options, Mapping):
+            if options is not None and "reset_mask" in options:
+                raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
+            self._wishes = deepcopy(dict(options or {}))
+            return
+        try:
+            each = [row["landmarks"] for row in options]
+        except (KeyError, TypeError):
+            each = []
+        if len(each) != self.num_envs:
             raise ValueError(
-                "options must be one dict for all rows (landmarks may have shape (B, K)), "
-                f"got {describe(options)}"
+                f"options must be a dict, or a list of {self.num_envs} dicts with 'landmarks', one "
+                f"a row, got {describe(options)}"
             )
-        self._wishes = dict(options or {})
+        problems = [self.engine.task.check_options({"landmarks": cells}) for cells in each]
+        cells = [problem.landmarks for problem in problems if problem is not None]
+        self._wishes = {"landmarks": np.array(cells)}
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every row; return the observations, shape (B, ...).
@@ -123,7 +163,8 @@ class MappSb3VecEnv(RowsVecEnv):
         ValueError
             If the options cannot be used.
         """
-        observations, _ = self.engine.reset(seed=self._seed, options=self._wishes)
+        observations, infos = self.engine.reset(seed=self._seed, options=self._wishes)
+        self._masks = infos["action_mask"]
         self._seed, self._wishes = None, {}
         self._returns[:] = 0.0
         self._lengths[:] = 0
@@ -149,6 +190,7 @@ class MappSb3VecEnv(RowsVecEnv):
             If an action is not valid; nothing has moved then.
         """
         transition = self.engine.advance(self._actions)
+        self._masks = transition.masks
         self._returns += transition.rewards
         self._lengths += 1
         infos: list[Any] = [NOTHING] * self.num_envs
@@ -170,6 +212,7 @@ class MappSb3VecEnv(RowsVecEnv):
             {
                 "terminal_observation": observation,
                 "TimeLimit.truncated": truncated,
+                "is_success": success,
                 "metrics": {
                     "success": success,
                     "cover_time": cover_time,
@@ -192,6 +235,21 @@ class MappSb3VecEnv(RowsVecEnv):
                 strict=True,
             )
         ]
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns
+        -------
+        ndarray of bool, shape (B, N * A) or, with ``central_action="joint"``, (B, A**N)
+            All False before the first reset.
+        """
+        return central_action_masks(self._masks, self.engine.joint_actions)
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """Return that rows have what ``Monitor`` gives: evaluations read ``episode`` then."""
+        monitored = wrapper_class is Monitor
+        return [monitored] * len(list(self._get_indices(indices)))
 
     # -- pictures ----------------------------------------------------------------------
 
