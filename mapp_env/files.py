@@ -23,6 +23,7 @@ __all__ = [
     "FileError",
     "Record",
     "check_writable",
+    "labelled",
     "read_bytes",
     "read_record",
     "write_bytes",
@@ -281,12 +282,16 @@ def write_record(
     FileError
         If it would be larger than ``limit`` bytes, or cannot be written.
     """
-    whole = {"format": f"mapp_env {kind}", "version": VERSION, **fields}
     lines = [
         f" {json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
-        for name, value in whole.items()
+        for name, value in labelled(kind, fields).items()
     ]
     write_text(path, "{\n" + ",\n".join(lines) + "\n}\n", limit)
+
+
+def labelled(kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a file with what says that it is one."""
+    return {"format": f"mapp_env {kind}", "version": VERSION, **fields}
 
 
 def write_text(path: str | os.PathLike[str], text: str, limit: int) -> None:
@@ -336,7 +341,7 @@ def check_writable(path: str | os.PathLike[str]) -> str:
         # A link stays a link: what it leads to is replaced.
         target = os.path.realpath(path)
         if os.path.exists(target) and not os.path.isfile(target):
-            raise FileError(f"{os.fspath(path)}: is there and not a regular file")
+            raise FileError(f"{describe(path)}: is there and not a regular file")
         os.stat(os.path.dirname(target))
     except (OSError, ValueError) as error:
         if isinstance(error, FileError):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import re
+import shlex
 import subprocess
 import sys
 import types
@@ -67,7 +69,7 @@ def test_solve_writes_what_it_prints(folder: Path, capsys: pytest.CaptureFixture
     options = ["--landmarks", *CELLS, "--out", "plan.json", "--picture", "a.gif"]
     found = record(capsys, "solve", *options)
     written = json.loads((folder / "plan.json").read_text())
-    assert {name: written[name] for name in found} == found
+    assert written == found
     plan = mapp_env.Plan.load("plan.json")
     assert plan == mapp_env.solve(PROBLEM)
     with Image.open("a.gif") as image:
@@ -207,6 +209,20 @@ def test_a_policy_plays(folder: Path, capsys: pytest.CaptureFixture[str], loader
     assert (found["success"], found["cover_time"]) == (True, 2)
 
 
+def test_a_loader_lies_in_the_working_directory(folder: Path) -> None:
+    """The console script finds a module beside it, as `python -m mapp_env` does."""
+    (folder / "strollers.py").write_text(
+        "class load:\n"
+        "    def __init__(self, name): pass\n"
+        "    def act(self, observations): return [[1, 1, 1]] * len(observations)\n",
+        encoding="ascii",
+    )
+    script = Path(sys.executable).parent / "mapp"
+    options = ["--out", "a.gif", "--policy", "x", "--policy-loader", "strollers:load"]
+    done = subprocess.run([script, "render", *options, "--landmarks", "26"], capture_output=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By default policies come from the baselines: the pretrained one never beats the optimum."""
     options = ["--policy", "pretrained", "--out", "a.gif", "--landmarks", *CELLS]
@@ -224,13 +240,14 @@ def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture
         ("solve --method exact --n-landmarks 30", "20 landmarks"),
         ("solve --method guess", "--method"),
         ("solve --objective speed", "--objective"),
-        ("solve --time-limit 0", "time_limit must be a positive number"),
-        ("solve --time-limit nan", "time_limit must be a positive number"),
-        ("solve --out no/plan.json", "cannot be written"),
+        ("solve --time-limit 0", "--time-limit must be a positive number"),
+        ("solve --time-limit nan", "--time-limit must be a positive number"),
+        ("solve --out no/plan.json", "--out .*cannot be written"),
+        ("solve --out=", "--out '': is there and not a regular file"),
         ("solve --picture a.bmp", r"--picture must end in \.gif.*got 'a.bmp'"),
         ("solve --picture no/a.gif", "cannot be written"),
-        ("solve --problem nope.json", "cannot be opened as a problem file"),
-        ("solve --problem bad.json", "bad.json: is not strict JSON"),
+        ("solve --problem nope.json", "--problem .*cannot be opened as a problem file"),
+        ("solve --problem bad.json", "--problem bad.json: is not strict JSON"),
         ("solve --problem bad.json --grid rooms", "--grid does not go with a problem file"),
         ("solve --problem bad.json --landmarks 1", "--landmarks does not go with a problem file"),
         (
@@ -242,12 +259,25 @@ def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture
         ("render --out a.gif --policy 3 --policy-loader walkers", "must be MODULE:FUNCTION"),
         ("render --out a.gif --policy 3 --policy-loader nowhere:load", "No module named 'nowhere'"),
         ("render --out a.gif --policy 3 --policy-loader walkers:fly", "no attribute 'fly'"),
-        ("render --out a.gif --policy 2 --policy-loader walkers:load", "action"),
+        ("render --out a.gif --policy 2 --policy-loader walkers:load", "--policy must act with"),
+        ("render --out a.gif --policy 2 --policy-loader .walkers:load", "MODULE:FUNCTION"),
+        ("render --out a.gif --policy 2 --policy-loader math:pi", "--policy '2': .*not callable"),
+        ("render --out a.gif --policy 2 --policy-loader math:sqrt", "must be real number"),
+        ("render --out a.gif --policy 2 --policy-loader os:getenv", "with act.., .* returns None"),
+        ("render --out a.gif --policy-loader walkers:load", "--policy-loader is for --policy"),
+        (
+            "render --out a.gif --seed 9223372036854775808",
+            r"--seed must be .*775807",
+        ),
+        ("solve --landmarks 1 --seed 9223372036854775808", "--seed must be an integer"),
+        ("solve --grid rooms --grid-seed -1", "--grid-seed must be an integer"),
+        ("solve --out a.gif --picture a.gif", "--picture must be another file than --out"),
+        ("solve --out a.json --picture /proc/a.gif", "/proc/a.gif"),
         ("render --out a.gif --policy nope", "pretrained, pretrained-distilled"),
-        ("render --out a.gif --policy pretrained --n-landmarks 3", "observations must"),
+        ("render --out a.gif --policy pretrained --n-landmarks 3", "--policy cannot play this"),
         ("universe --n-landmarks 9", "273,438,880 problems"),
-        ("universe --n-landmarks 0", "n_landmarks must be"),
-        ("universe --n-agents 17", "n_agents must be"),
+        ("universe --n-landmarks 0", "--n-landmarks must be"),
+        ("universe --n-agents 17", "--n-agents must be"),
         ("universe --landmarks 3", "--landmarks"),
         ("info --surprise", "--surprise"),
     ],
@@ -266,6 +296,35 @@ def test_refusals_are_one_line(
     assert (status, streams.out) == (2, "")
     assert re.fullmatch(rf"error: [^\n]*({words})[^\n]*\n", streams.err), streams.err
     assert [path.name for path in folder.iterdir()] == ["bad.json"]
+
+
+@pytest.mark.parametrize(
+    ("redirected", "status", "told"),
+    [
+        (">/dev/full", 2, "error: the standard output cannot be written: .*"),
+        (">&-", 0, ""),
+        ("0 2>&-", 2, ""),
+    ],
+)
+def test_closed_and_full_streams(redirected: str, status: int, told: str) -> None:
+    """A full disk is said; a closed stream is none to write into, and no other takes its part."""
+    line = f"{shlex.quote(sys.executable)} -m mapp_env solve --landmarks 0 {redirected}"
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (status, "")
+    assert re.fullmatch(told, done.stderr.strip()), done.stderr
+
+
+def test_names_of_any_letters_are_printed(folder: Path) -> None:
+    """A file's name that the terminal cannot show is printed with escapes."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mapp_env", "solve", "--landmarks", "0", "--out", "\xe9.json"],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "wrote \\xe9.json" in done.stdout
+    assert (folder / "\xe9.json").is_file()
 
 
 def test_without_the_baselines_policies_say_what_to_install(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ A command's file has ``add_arguments(parser)``, ``run(arguments)`` and a docstri
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -61,19 +62,41 @@ def main(command_line: Sequence[str] | None = None) -> int:
         )
         command.add_arguments(sub)
         sub.set_defaults(run=command.run)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may hold any letter
     arguments = parser.parse_args(command_line)
     try:
         arguments.run(arguments)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as it is where it was closed before the start
+            sys.stdout.flush()
     except BrokenPipeError:
-        # Nobody reads on; and Python should not complain of it when it flushes at the end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()  # nobody reads on
     except (ValueError, ImportError) as error:
-        print(f"error: {_one_line(str(error))}", file=sys.stderr)
-        return REFUSED
+        return _refuse(_name_option(str(error), arguments))
+    except OSError as error:
+        _drop_output()
+        return _refuse(f"the standard output cannot be written: {error}")
     except KeyboardInterrupt:
         return INTERRUPTED
     return 0
+
+
+def _refuse(message: str) -> int:
+    if sys.stderr is not None:  # else it would go to the standard output
+        print(f"error: {_one_line(message)}", file=sys.stderr)
+    return REFUSED
+
+
+def _name_option(message: str, arguments: argparse.Namespace) -> str:
+    """Return a message of the package, which begins with an argument's name, for the option."""
+    name, space, rest = message.partition(" ")
+    return f"--{name.replace('_', '-')}{space}{rest}" if name in arguments else message
+
+
+def _drop_output() -> None:
+    """Let nothing more go to the standard output: Python would complain when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _one_line(message: str) -> str:

@@ -11,11 +11,25 @@ from mapp_env.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
-__all__ = ["DEFAULT_FPS", "PICTURES", "picture_writer"]
+__all__ = ["DEFAULT_FPS", "PICTURES", "check_file", "picture_writer"]
 
 ANIMATIONS, FIGURES = (".gif",), (".png", ".svg", ".pdf")
 PICTURES = (*ANIMATIONS, *FIGURES)
 DEFAULT_FPS = 4.0
+
+
+def check_file(option: str, out: str) -> str:
+    """Return what a path leads to, if a file could be written there.
+
+    Raises
+    ------
+    ValueError
+        If none could; the message names the option.
+    """
+    try:
+        return check_writable(out)
+    except ValueError as error:
+        raise ValueError(f"{option} {error}") from error
 
 
 def picture_writer(
@@ -46,7 +60,7 @@ def picture_writer(
         raise ValueError(f"{option} must end in {', '.join(PICTURES)}, got {describe(out)}")
     if suffix in FIGURES and fps is not None:
         raise ValueError("--fps is for animations: it does not go with a figure")
-    check_writable(out)
+    check_file(option, out)
     if suffix in ANIMATIONS:
         return _animation(out, DEFAULT_FPS if fps is None else fps)
     return _figure(out)

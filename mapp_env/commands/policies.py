@@ -7,9 +7,10 @@ a policy is asked for; by default it is that of the baselines that are developed
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+import os
+import sys
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,29 +24,36 @@ __all__ = ["DEFAULT_LOADER", "load_policy", "play_policy"]
 
 DEFAULT_LOADER = "baselines.policy:load_policy"
 
-Act = Callable[[NDArray[np.float32]], Any]
+
+class Policy(Protocol):
+    """What a loader returns."""
+
+    def act(self, observations: NDArray[np.float32], /) -> Any:
+        """Return actions (B, N) for global observations (B, N + 2K)."""
 
 
-def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Act:
-    """Return what a policy does: global observations (B, N + 2K) to actions (B, N).
+def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
+    """Return what a loader makes of a policy's name.
 
     Parameters
     ----------
     name : str
         Of the policy, as the loader knows it.
     loader : str
-        ``MODULE:FUNCTION``; the function takes the name, and what it returns has a method ``act``.
+        ``MODULE:FUNCTION``, also of a module in the working directory.
 
     Raises
     ------
     ValueError
-        If the loader is not written so or refuses the name.
+        If the loader is not written so, fails on the name, or returns no policy.
     ImportError
         If there is no such loader.
     """
     module, _, function = loader.partition(":")
-    if not module or not function.isidentifier():
+    if not all(part.isidentifier() for part in (*module.split("."), function)):
         raise ValueError(f"--policy-loader must be MODULE:FUNCTION, got {describe(loader)}")
+    if os.getcwd() not in sys.path:  # `python -m` has it there, a console script has not
+        sys.path.insert(0, os.getcwd())
     try:
         load = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError) as error:
@@ -55,11 +63,19 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Act:
             else ""
         )
         raise ImportError(f"policies are loaded by {loader}, but: {error}{hint}") from error
-    act: Act = load(name).act
-    return act
+    try:
+        policy: Policy = load(name)
+    except Exception as error:  # whatever it is, it is the loader's, not ours
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise ValueError(f"--policy {describe(name)}: {loader} refuses it: {reason}") from error
+    if not callable(getattr(policy, "act", None)):
+        raise ValueError(
+            f"--policy-loader must return something with act(), {loader} returns {describe(policy)}"
+        )
+    return policy
 
 
-def play_policy(act: Act, problem: Problem, max_cycles: int) -> Plan:
+def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     """Return what the rules make of a policy's episode.
 
     Raises
@@ -77,7 +93,22 @@ def play_policy(act: Act, problem: Problem, max_cycles: int) -> Plan:
     observation, _ = env.reset(seed=0, options={"landmarks": problem.landmarks})
     actions, over = [], False
     while not over:
-        actions.append(np.asarray(act(observation[None]))[0])
+        actions.append(_act(policy, observation, problem.n_agents))
         observation, _, terminated, truncated, _ = env.step(actions[-1])
         over = terminated or truncated
     return replay(replace(problem, max_cycles=max_cycles), np.array(actions))
+
+
+def _act(policy: Policy, observation: NDArray[np.float32], n_agents: int) -> NDArray[np.int64]:
+    """Return a policy's joint action, shape (N,)."""
+    try:
+        found = np.asarray(policy.act(observation[None]))
+    except Exception as error:  # whatever it is, it is the policy's, not ours
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise ValueError(f"--policy cannot play this problem: {reason}") from error
+    if found.shape != (1, n_agents) or found.dtype.kind not in "iu":
+        raise ValueError(
+            f"--policy must act with integers of shape (1, {n_agents}), got {describe(found)}"
+        )
+    actions: NDArray[np.int64] = found[0].astype(np.int64)
+    return actions

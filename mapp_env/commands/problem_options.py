@@ -10,7 +10,7 @@ from mapp_env.grid import Grid
 from mapp_env.grids import generator_names, grid_names, make_grid
 from mapp_env.problem import Problem, sample_problems
 from mapp_env.task import find_grid
-from mapp_env.validation import describe
+from mapp_env.validation import check_count, describe
 
 __all__ = [
     "add_grid_options",
@@ -18,8 +18,10 @@ __all__ = [
     "grid_of",
     "problem_of",
     "refuse_problem_options",
+    "seed_of",
 ]
 
+MAX_DRAWN = 2**63 - 1  # of seeds
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
 OPTIONS = ("problem", "grid", "rows", "cols", "grid_seed", "landmarks", "n_landmarks", "n_agents")
 
@@ -74,17 +76,31 @@ def problem_of(arguments: argparse.Namespace) -> Problem:
     """
     if arguments.problem is not None:
         refuse_problem_options(arguments, "a problem file", but="problem")
-        return Problem.load(arguments.problem)
+        try:
+            return Problem.load(arguments.problem)
+        except ValueError as error:
+            raise ValueError(f"--problem {error}") from error
     grid = grid_of(arguments)
     n_agents = N_AGENTS if arguments.n_agents is None else arguments.n_agents
     landmarks = arguments.landmarks
     if landmarks is None:
         count = N_LANDMARKS if arguments.n_landmarks is None else arguments.n_landmarks
-        seed = 0 if arguments.seed is None else arguments.seed
+        seed = seed_of(arguments)
         landmarks = sample_problems(grid, 1, n_landmarks=count, seed=seed)[0].tolist()
     elif arguments.n_landmarks is not None:
         raise ValueError("--n-landmarks is how many to draw: it does not go with --landmarks")
     return Problem(grid, landmarks, n_agents)
+
+
+def seed_of(arguments: argparse.Namespace) -> int:
+    """Return the seed of all that is drawn but the grid.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    return check_count("--seed", 0 if arguments.seed is None else arguments.seed, 0, MAX_DRAWN)
 
 
 def refuse_problem_options(arguments: argparse.Namespace, reason: str, but: str = "") -> None:
@@ -109,6 +125,8 @@ def grid_of(arguments: argparse.Namespace) -> Grid:
         If there is none.
     """
     name = GRID if arguments.grid is None else arguments.grid
+    if arguments.grid_seed is not None:
+        check_count("--grid-seed", arguments.grid_seed, 0, MAX_DRAWN)
     options = {
         option: value
         for option, value in (

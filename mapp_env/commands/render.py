@@ -28,12 +28,13 @@ from mapp_env.commands.problem_options import (
     add_problem_options,
     problem_of,
     refuse_problem_options,
+    seed_of,
 )
 from mapp_env.commands.reports import add_json_option, costs_line, costs_record, print_report
 from mapp_env.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers import solve
-from mapp_env.validation import MAX_SEED, check_count
+from mapp_env.validation import check_count
 
 __all__ = ["add_arguments", "run"]
 
@@ -60,7 +61,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--policy-loader",
-        default=DEFAULT_LOADER,
         metavar="MODULE:FUNCTION",
         help="what turns the name into something with act(observations (B, N + 2K)) -> actions "
         f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
@@ -112,17 +112,19 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
         raise ValueError("--objective is for --plan optimum")
     if arguments.max_cycles is not None and source not in ("random", "policy"):
         raise ValueError("--max-cycles is for --plan random and --policy")
+    if arguments.policy_loader is not None and source != "policy":
+        raise ValueError("--policy-loader is for --policy")
     if source not in ("optimum", "random", "policy"):
         return _read_plan(arguments, source)
     problem = problem_of(arguments)
-    seed = check_count("--seed", 0 if arguments.seed is None else arguments.seed, 0, MAX_SEED)
+    seed = seed_of(arguments)
     if source == "optimum":
         return problem, solve(problem, arguments.objective or "cover_time", seed=seed)
     limit = STEPS if arguments.max_cycles is None else arguments.max_cycles
     limit = check_count("--max-cycles", limit, 1, MAX_STEPS)
     if source == "policy":
-        act = load_policy(arguments.policy, arguments.policy_loader)
-        return problem, play_policy(act, problem, limit)
+        policy = load_policy(arguments.policy, arguments.policy_loader or DEFAULT_LOADER)
+        return problem, play_policy(policy, problem, limit)
     problem = replace(problem, max_cycles=limit)
     generator, _ = seeding.np_random(seed)
     return problem, replay(problem, generator.integers(0, 4, (limit, problem.n_agents)))
@@ -132,7 +134,10 @@ def _read_plan(arguments: argparse.Namespace, file: str) -> tuple[Problem, Plan]
     refuse_problem_options(arguments, "a plan file, which brings its problem along")
     if arguments.seed is not None:
         raise ValueError("--seed does not go with a plan file")
-    plan = Plan.load(file)
+    try:
+        plan = Plan.load(file)
+    except ValueError as error:
+        raise ValueError(f"--plan {error}") from error
     if plan.problem is None:
-        raise ValueError(f"{file}: has no problem")
+        raise ValueError(f"--plan {file}: has no problem")
     return plan.problem, plan

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import argparse
 
-from mapp_env.commands.pictures import PICTURES, picture_writer
-from mapp_env.commands.problem_options import add_problem_options, problem_of
+from mapp_env.commands.pictures import PICTURES, check_file, picture_writer
+from mapp_env.commands.problem_options import add_problem_options, problem_of, seed_of
 from mapp_env.commands.reports import add_json_option, costs_line, print_report
-from mapp_env.files import check_writable
+from mapp_env.files import labelled
 from mapp_env.plan import OBJECTIVES, Plan
 from mapp_env.solvers import METHODS, solve
 
@@ -61,10 +61,11 @@ def run(arguments: argparse.Namespace) -> None:
     ImportError
         If a library that was asked for is not there.
     """
-    if arguments.out is not None:
-        check_writable(arguments.out)
+    out = None if arguments.out is None else check_file("--out", arguments.out)
     draw = None
     if arguments.picture is not None:
+        if out == check_file("--picture", arguments.picture):
+            raise ValueError("--picture must be another file than --out")
         draw = picture_writer("--picture", arguments.picture)
     problem = problem_of(arguments)
     plan = solve(
@@ -72,15 +73,15 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.objective,
         arguments.method,
         arguments.time_limit,
-        0 if arguments.seed is None else arguments.seed,
+        seed_of(arguments),
     )
+    if draw is not None:
+        draw(problem, plan)  # first, as more can stand in its way
     if arguments.out is not None:
         plan.save(arguments.out)
-    if draw is not None:
-        draw(problem, plan)
     lines = [costs_line(problem, plan), *_tour_lines(plan), _made_line(plan)]
     lines += [f"wrote {name}" for name in (arguments.out, arguments.picture) if name is not None]
-    print_report(arguments, plan.to_record(), lines)
+    print_report(arguments, labelled("plan", plan.to_record()), lines)
 
 
 def _tour_lines(plan: Plan) -> list[str]:

@@ -69,7 +69,7 @@ def solve_universe(
         )
     if n_problems > MAX_UNIVERSE_PROBLEMS or n_problems * 3**n_landmarks > MAX_UNIVERSE_WORK:
         raise ValueError(
-            f"this grid has {n_problems:,} problems of {n_landmarks} landmarks; solve_universe() "
+            f"this grid has {n_problems:,} problems of {n_landmarks} landmarks; a universe "
             f"takes at most {MAX_UNIVERSE_PROBLEMS:,}, and {MAX_UNIVERSE_WORK:,} problems times "
             f"3 ** n_landmarks: use sample_problems() and solve()"
         )
