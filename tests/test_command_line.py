@@ -87,7 +87,10 @@ def test_a_figure_needs_matplotlib_and_says_so(tmp_path: Path) -> None:
     )
     done = command(["render", "--out", "a.png"], tmp_path, code)
     assert done.returncode == 2
-    assert done.stderr == 'error: draw_plan needs matplotlib: pip install "mapp_env[figures]"\n'
+    assert (
+        done.stderr
+        == 'error: draw_plan needs matplotlib 3.8 or later: pip install "matplotlib>=3.8"\n'
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["a.gif"]
 
 

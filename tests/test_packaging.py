@@ -1,4 +1,4 @@
-"""What is released: the wheel holds the package alone, the sdist its sources and tests."""
+"""What is released: the wheel holds the package alone, the sdist its sources."""
 
 from __future__ import annotations
 
@@ -57,13 +57,15 @@ def test_the_wheel_holds_the_package_alone(built: Path) -> None:
 
 
 def test_the_sdist_holds_no_weights_and_no_documents(built: Path) -> None:
-    """Sources, tests and the texts of a release; neither trained weights nor pictures."""
+    """Sources and the texts of a release; no trained weights, no pictures, no tests of the rest."""
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"mapp_env/__init__.py", "LICENSE", "README.md", "CHANGELOG.md", "PKG-INFO"} <= names
     assert not {name for name in names if Path(name).suffix in HEAVY}
-    assert not {name for name in names if name.startswith(("docs/", "baselines/", "runs/"))}
+    assert not {
+        name for name in names if name.startswith(("docs/", "baselines/", "runs/", "tests/"))
+    }
     assert path.stat().st_size < 1_000_000
 
 

@@ -279,6 +279,31 @@ def test_mouse_moves_a_flag(visit):
     assert len(set(flags_of(page)) & set(GRID.reachable.tolist())) == 5
 
 
+def test_other_buttons_drag_nothing(visit):
+    """The right button's menu leaves the flags where they are."""
+    page = visit()
+    cells = page.locator("#network-board .cells [data-cell]")
+    for button in ("right", "middle"):
+        cells.nth(0).hover()
+        page.mouse.down(button=button)
+        cells.nth(2).hover()
+        page.mouse.up(button=button)
+    assert flags_of(page) == FIRST
+
+
+def test_keyboard_keeps_its_place(visit):
+    """A button that is of no use any more hands the keyboard on to the next."""
+    page = visit()
+    page.focus("#step")
+    for _ in range(18):
+        page.keyboard.press("Enter")
+    assert page.inner_text("#now").startswith("Step 18 of 18")
+    assert page.evaluate("document.activeElement.id") == "play"
+    page.focus("#start")
+    page.keyboard.press("Enter")
+    assert page.evaluate("document.activeElement.id") == "play"
+
+
 def test_time_passes(visit):
     """Steps go on and back, and what plays comes to its end by itself."""
     page = visit()
@@ -354,17 +379,42 @@ def test_page_opens_on_a_bad_link(hash_, visit):
     assert page.is_hidden("#alert")
 
 
+CONTRAST = """selector => {
+    const channels = colour => colour.match(/[0-9.]+/g).slice(0, 3).map(Number);
+    const light = colour => channels(colour).map(c => c / 255)
+        .map(c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4)
+        .reduce((sum, c, i) => sum + [0.2126, 0.7152, 0.0722][i] * c, 0);
+    const element = document.querySelector(selector);
+    let ground = element;
+    const colourOf = e => getComputedStyle(e).backgroundColor;
+    while (colourOf(ground) === "rgba(0, 0, 0, 0)") ground = ground.parentElement;
+    const pair = [light(getComputedStyle(element).color), light(colourOf(ground))];
+    return (Math.max(...pair) + 0.05) / (Math.min(...pair) + 0.05);
+}"""
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_readable_on_a_phone(scheme, visit):
-    """At a width of 360 pixels nothing reaches over the side; either plan can be looked at."""
-    page = visit("#0,6,20,24,48", viewport={"width": 360, "height": 740}, color_scheme=scheme)
+def test_small_letters_stand_out(scheme, visit):
+    """Letters have a contrast of 4.5 or more to what they stand on, as WCAG 2 asks for."""
+    page = visit(color_scheme=scheme)
+    page.evaluate("document.querySelector('#verdict').dataset.kind = 'gap'")
+    chips = [f".agent-{agent} .chip" for agent in range(3)]
+    for selector in ("#verdict", ".fine", ".about p", "thead th", "#now", "#play", *chips):
+        assert page.evaluate(CONTRAST, selector) >= 4.5, selector
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [320, 360])
+def test_readable_on_a_phone(scheme, width, visit):
+    """On a narrow screen nothing reaches over the side; either plan can be looked at."""
+    page = visit("#0,6,20,24,48", viewport={"width": width, "height": 740}, color_scheme=scheme)
     assert page.is_visible("#alert")
     for view, hidden in (("network", "optimum"), ("optimum", "network")):
         page.locator(f"#views [value={view}]").check(force=True)
         assert page.is_visible(f"#{view}-board")
         assert page.is_hidden(f"#{hidden}-board")
-        assert page.evaluate("document.documentElement.scrollWidth") == 360
-        assert page.evaluate("document.body.scrollWidth") <= 360
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+        assert page.evaluate("document.body.scrollWidth") <= width
     floor = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert (max(map(int, floor[4:-1].split(","))) < 60) == (scheme == "dark")
 
@@ -387,3 +437,4 @@ def test_damaged_weights_are_said(damage, said, visit, tmp_path):
     assert page.inner_text("#alert").startswith("The network cannot be read: ")
     assert said in page.inner_text("#alert")
     assert "export_playground.py" in page.inner_text("#alert")
+    assert page.locator("button:enabled").count() == 0

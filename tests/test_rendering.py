@@ -382,7 +382,7 @@ def test_missing_pygame_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     rendering = importlib.import_module("mapp_env.rendering")
     monkeypatch.delitem(vars(rendering), "Window", raising=False)
     before = dict(os.environ)
-    with pytest.raises(ImportError, match=r'pip install "mapp_env\[human\]"'):
+    with pytest.raises(ImportError, match=r'pip install "pygame-ce>=2.5"'):
         _ = rendering.Window
     assert dict(os.environ) == before
 

@@ -339,6 +339,6 @@ def test_missing_pyvrp_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         return real_import(name, *args, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(builtins, "__import__", fake_import)
-    with pytest.raises(ImportError, match=r"pip install \"mapp-env\[pyvrp\]\""):
+    with pytest.raises(ImportError, match=r"pip install \"pyvrp>=0.14,<0.15\""):
         solve_pyvrp(random_problem(0), "makespan")
     assert solve_search(random_problem(0), "makespan", iterations=1).routes

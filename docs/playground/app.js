@@ -147,6 +147,7 @@
     pause();
     stopSearch();
     let tried = 0;
+    $("message").setAttribute("aria-live", "off"); // nobody wants each count read out
     const search = () => {
       for (let i = 0; i < AT_ONCE; i++) {
         const flags = draw(spec.n_landmarks);
@@ -157,7 +158,7 @@
         }
       }
       if (tried >= TRIES) {
-        state.search = null;
+        stopSearch();
         return say(`Optimal on all ${tried} problems that were drawn. Try again?`);
       }
       say(`Optimal on ${tried} problems so far …`);
@@ -170,6 +171,7 @@
   function stopSearch() {
     clearTimeout(state.search);
     state.search = null;
+    $("message").setAttribute("aria-live", "polite");
   }
 
   // -- time ------------------------------------------------------------------------------------
@@ -205,11 +207,17 @@
     // While time runs, nobody wants each step read out.
     $("now").setAttribute("aria-live", timer ? "off" : "polite");
     $("now").textContent = plans ? [shown, ...news(plans, step, flags)].join(" · ") : "";
-    for (const id of ["start", "back"]) $(id).disabled = !plans || step === 0;
-    $("step").disabled = !plans || step === last;
     for (const id of ["play", "time"]) $(id).disabled = !plans;
+    for (const id of ["start", "back"]) disable($(id), !plans || step === 0);
+    disable($("step"), !plans || step === last);
     document.querySelector(".player").classList.toggle("playing", timer !== null);
     document.querySelector("#play span").textContent = timer === null ? "Play" : "Pause";
+  }
+
+  /** Disable a button or not; the keyboard is not left without a place. */
+  function disable(button, disabled) {
+    if (disabled && button === document.activeElement) $("play").focus();
+    button.disabled = disabled;
   }
 
   function news(plans, step, flags) {
@@ -289,6 +297,7 @@
       network = new mapp.Network(mapp.policy, grid);
     } catch (error) {
       warn(`The network cannot be read: ${error.message} Its file is made by baselines/export_playground.py.`);
+      for (const control of document.querySelectorAll("button, input, select")) control.disabled = true;
       return;
     }
     const handlers = { press, drag, remove, cancel };
@@ -296,6 +305,7 @@
       ["network", "optimum"].map((name) => [name, new mapp.Board($(`${name}-board`), grid, handlers)]),
     );
     $("about-network").textContent = aboutNetwork();
+    if (location.protocol === "file:") $("link-note").textContent = ", for this machine: the page is opened as a file";
     connect();
     followLink(FIRST);
     Object.assign(mapp, { grid, plansOf, network });

@@ -137,6 +137,7 @@
     onGrab(event) {
       const from = this.cellOf(event.target);
       if (from === null || !this.flags.includes(from)) return;
+      if (event.button !== 0 || !event.isPrimary) return; // menus are no drags
       const release = (end) => {
         window.removeEventListener("pointerup", release);
         window.removeEventListener("pointercancel", release);

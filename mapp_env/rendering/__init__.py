@@ -61,7 +61,8 @@ def __getattr__(name: str) -> Any:
         if (error.name or "").split(".")[0] != "matplotlib":
             raise
         raise ImportError(
-            f'{name} needs matplotlib: pip install "mapp_env[figures]"', name="matplotlib"
+            f'{name} needs matplotlib 3.8 or later: pip install "matplotlib>=3.8"',
+            name="matplotlib",
         ) from error
     globals()[name] = value
     return value

@@ -17,7 +17,7 @@ try:
         raise ImportError(f"{pygame.__name__} {pygame.version.ver} has no Window")
 except ImportError as error:
     raise ImportError(
-        'render_mode="human" needs pygame-ce 2.5 or later: pip install "mapp_env[human]"'
+        'render_mode="human" needs pygame-ce 2.5 or later: pip install "pygame-ce>=2.5"'
     ) from error
 finally:
     if _had_prompt is None:

@@ -6,7 +6,7 @@ PyVRP (Wouda, Lan and Kool 2024, doi:10.1287/ijoc.2023.0055) minimises the sum o
   each time, until it finds none;
 - open routes are closed ones whose arcs back to the depot cost nothing.
 
-It comes with ``pip install "mapp-env[pyvrp]"`` and is imported when a problem is solved.
+It comes with the extra ``pyvrp`` and is imported when a problem is solved.
 """
 
 from __future__ import annotations
@@ -188,6 +188,6 @@ def _import_pyvrp() -> Any:
         import pyvrp.exceptions
     except ImportError as error:
         raise ImportError(
-            'method "pyvrp" needs the extra of that name: pip install "mapp-env[pyvrp]"'
+            'method "pyvrp" needs the package of that name: pip install "pyvrp>=0.14,<0.15"'
         ) from error
     return pyvrp
