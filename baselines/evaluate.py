@@ -31,6 +31,7 @@ from baselines.evaluation import (
     every_problem,
     find_optima,
     format_table,
+    out_of_reach,
     save_table,
     unseen_problems,
 )
@@ -140,8 +141,8 @@ def choose_problems(args: Args, setting: Setting, seen: list[tuple[int, ...]]) -
 
 
 def worst_cases(evaluation: Evaluation) -> list[str]:
-    """Return lines on the first unsolved problem and the first of the largest gap, if any."""
-    lines = []
+    """Return lines on problems that nobody solves, that this one does not, and the largest gap."""
+    lines = out_of_reach(evaluation.setting, evaluation.optima)
     if evaluation.optima is None:
         lines.append(f"no gaps: optima are proven up to {MAX_EXACT_LANDMARKS} landmarks")
     unsolved = ~evaluation.success

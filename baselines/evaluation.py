@@ -87,6 +87,19 @@ def find_optima(setting: Setting, landmarks: np.ndarray) -> Optima | None:
     return Optima(*(_optimal_costs(setting, landmarks, objective) for objective in OBJECTIVES))
 
 
+def out_of_reach(setting: Setting, optima: Optima | None) -> list[str]:
+    """Return a line on problems whose optimum already takes more than the step limit, if any."""
+    if optima is None:
+        return []
+    count = int((optima.cover_time > setting.max_cycles).sum())
+    if count == 0:
+        return []
+    return [
+        f"out of reach: {count:,} of {len(optima.cover_time):,} problems take more than "
+        f"{setting.max_cycles} steps at their optimum (the limit is --max-cycles)"
+    ]
+
+
 def _optimal_costs(setting: Setting, landmarks: np.ndarray, objective: str) -> np.ndarray:
     if setting.n_landmarks <= MAX_BATCH_LANDMARKS:
         return optimal_costs(setting.grid, landmarks, setting.n_agents, objective)

@@ -26,6 +26,7 @@ from baselines.evaluation import (
     evaluate,
     find_optima,
     format_table,
+    out_of_reach,
     save_table,
     unseen_problems,
 )
@@ -39,6 +40,7 @@ from baselines.policy import (
     save_policy,
 )
 from baselines.runs import (
+    METRICS_FILE,
     TIMING_FILE,
     WEIGHTS_FILE,
     RunFolder,
@@ -146,6 +148,8 @@ def evaluate_training(
     else:
         print(f"no row for the nearest landmark: the grid has more than {MAX_TABLE_CELLS:,} cells")
     optima = find_optima(setting, problems)
+    for line in out_of_reach(setting, optima):
+        print(line)
     return {
         label: evaluate(policy, setting, problems, optima, n_kept=N_ROUTES, progress=label)
         for label, policy in policies.items()
@@ -201,6 +205,8 @@ def run_experiment(
                 f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there are "
                 "no more unseen ones"
             )
+        # Without a terminal there is no bar: say where to look.
+        print(f"training, {args.n_episodes} episodes: {run.path(METRICS_FILE)}", flush=True)
         with signals:
             train(training, run, checkpoints, signals)
         print(

@@ -33,9 +33,8 @@ class Judgement(NamedTuple):
     mean_return: float  # undiscounted, of all problems
 
     def __str__(self) -> str:
-        return (
-            f"return {self.mean_return:.1f}, solved {self.solved:.1f} %, mean gap {self.gap:.1f} %"
-        )
+        gap = "-" if math.isnan(self.gap) else f"{self.gap:.1f} %"
+        return f"return {self.mean_return:.1f}, solved {self.solved:.1f} %, mean gap {gap}"
 
 
 def unseen_landmarks(

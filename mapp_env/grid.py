@@ -107,6 +107,9 @@ class Grid:
     def load(cls, path: str | os.PathLike[str], depot: object = None) -> Grid:
         """Read a grid from a text or MovingAI ``.map`` file of at most 1 MiB.
 
+        A text file has a line for each row: ``#``, ``@``, ``T`` or ``O`` is a wall, ``.`` or ``G``
+        a free cell, ``D`` the depot.
+
         Parameters
         ----------
         path : str or os.PathLike

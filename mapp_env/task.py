@@ -22,7 +22,7 @@ from mapp_env.dynamics import (
     manhattan_table,
 )
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
-from mapp_env.grids import grid_names, make_grid
+from mapp_env.grids import generator_names, grid_names, make_grid
 from mapp_env.observation import Observation, View, view
 from mapp_env.problem import (
     MAX_AGENTS,
@@ -264,6 +264,11 @@ def find_grid(grid: object) -> Grid:
         return make_grid(grid)
     if isinstance(grid, os.PathLike) or (isinstance(grid, str) and os.path.lexists(grid)):
         return Grid.load(grid)
+    if isinstance(grid, str) and grid in generator_names():
+        raise ValueError(
+            f"grid must be a mapp_env.Grid, a bundled name or a map file: "
+            f"mapp_env.make_grid({grid!r}) generates one; got {grid!r}"
+        )
     raise ValueError(
         f"grid must be a mapp_env.Grid, a bundled name ({', '.join(grid_names())}) or a path to a "
         f"map file; got {describe(grid, 320)}"

@@ -424,5 +424,7 @@ def test_rows_have_no_attributes_of_their_own() -> None:
     envs: MappSb3VecEnv = make_sb3_vec(3)
     assert envs.get_attr("render_mode") == [None] * 3
     assert envs.get_attr("num_envs", indices=[0, 2]) == [3, 3]
+    assert envs.get_attr("action_space") == [envs.action_space] * 3
+    assert envs.get_attr("observation_space") == [envs.observation_space] * 3
     assert not envs.has_attr("nothing_of_this_name")
     assert envs.env_is_wrapped(gymnasium.Wrapper, indices=1) == [False]

@@ -269,3 +269,16 @@ def test_shares_are_never_rounded_up_to_all():
     for tenths in range(1001):
         share = 100.0 * (tenths / 1000)
         assert evaluation_module._format_cell("solved %", share) == f"{tenths / 10:.2f}"
+
+
+def test_problems_out_of_reach_are_said(capsys):
+    """Where even the optimum takes more than the step limit, a line says of how many problems."""
+    setting = Setting(make_grid(), 3, 1, 5)
+    count = int((find_optima(setting, every_problem(setting)).cover_time > 5).sum())
+    assert 0 < count < 40
+    asked = {"policy": "nearest", "problems": "universe", "n_landmarks": 1}
+    script.main(script.Args(**asked, max_cycles=5))
+    said = f"out of reach: {count} of 40 problems take more than 5 steps"
+    assert said in capsys.readouterr().out
+    script.main(script.Args(**asked))
+    assert "out of reach" not in capsys.readouterr().out

@@ -53,6 +53,7 @@ def test_an_animation_end_to_end(tmp_path: Path) -> None:
         f"wrote a.gif: {(tmp_path / 'a.gif').stat().st_size} bytes",
         f"cover time {optimum.cover_time}, makespan {optimum.makespan}, total distance "
         f"{optimum.total_distance}; the cover time is proven optimal",
+        f"landmarks: {' '.join(LANDMARKS)}",
     ]
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == optimum.cover_time + 1
@@ -214,7 +215,7 @@ def test_seed_draws_the_landmarks_not_the_grid(folder: Path) -> None:
         (["--out", "gif"], "--out must end in"),
         (["--out", "no/a.gif"], "cannot be written"),
         (["--out", "dir.gif"], "not a regular file"),
-        (["--grid", "nope"], "--grid must be one of paper-7x7, .*rooms.*got 'nope'"),
+        (["--grid", "nope"], "--grid must be one of paper-7x7, .*rooms.*no file 'nope'"),
         (["--grid", "bad.txt"], "bad.txt"),
         (["--grid", "rooms", "--rows", "9999"], r"--rows must be an integer in 3\.\.512"),
         (["--rows", "9"], "--rows, --cols and --grid-seed are for generated grids"),

@@ -60,8 +60,9 @@ def test_solve_prints_the_optimum(capsys: pytest.CaptureFixture[str], objective:
         f"{plan.total_distance}; the {words} is proven optimal"
     )
     tours = [" ".join(map(str, tour)) or "stays at the depot" for tour in plan.tours]
-    assert lines[1:4] == [f"agent {agent}: {tour}" for agent, tour in enumerate(tours)]
-    assert re.fullmatch(r"by exact in \d+\.\d ms", lines[4])
+    assert lines[1] == f"landmarks: {' '.join(CELLS)}"
+    assert lines[2:5] == [f"agent {agent}: {tour}" for agent, tour in enumerate(tours)]
+    assert re.fullmatch(r"by exact in \d+\.\d ms", lines[5])
 
 
 def test_solve_writes_what_it_prints(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -86,6 +87,17 @@ def test_a_problem_file_is_a_problem(folder: Path, capsys: pytest.CaptureFixture
     drawn = record(capsys, "render", "--problem", "problem.json", "--out", "a.gif")
     assert (drawn["cover_time"], drawn["status"]) == (cost, "optimal")
     assert drawn["bytes"] == (folder / "a.gif").stat().st_size
+
+
+def test_a_map_files_depot_is_chosen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """--depot puts the depot of a map file somewhere else; grids that bring one refuse it."""
+    (folder / "yard.txt").write_text("..#\n..#\n...\n", encoding="ascii")
+    options = ["solve", "--grid", "yard.txt", "--landmarks", "8", "--n-agents", "1"]
+    far = record(capsys, *options, "--depot", "0,0")
+    assert (far["cover_time"], far["tours"][0][0]) == (4, 0)
+    assert record(capsys, *options, "--depot", "7")["cover_time"] == 1
+    assert main(["solve", "--depot", "0"]) == 2
+    assert "--depot is for map files, not for 'paper-7x7'" in capsys.readouterr().err
 
 
 def test_a_search_says_what_is_not_proven(capsys: pytest.CaptureFixture[str]) -> None:
@@ -134,6 +146,13 @@ def test_universe_draws_its_histogram(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 # -- info --------------------------------------------------------------------------------------
+
+
+def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None:
+    """--version says what is installed."""
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"mapp_env {mapp_env.__version__}\n"
 
 
 def test_info_tells_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -275,6 +294,7 @@ def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture
         ("solve --out a.json --picture /proc/a.gif", "/proc/a.gif"),
         ("render --out a.gif --policy nope", "pretrained, pretrained-distilled"),
         ("render --out a.gif --policy pretrained --n-landmarks 3", "--policy cannot play this"),
+        ("solve --grid no/such.map", "no file 'no/such.map'"),
         ("universe --n-landmarks 9", "273,438,880 problems"),
         ("universe --n-landmarks 0", "--n-landmarks must be"),
         ("universe --n-agents 17", "--n-agents must be"),

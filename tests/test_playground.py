@@ -279,6 +279,38 @@ def test_mouse_moves_a_flag(visit):
     assert len(set(flags_of(page)) & set(GRID.reachable.tolist())) == 5
 
 
+def test_a_dragged_flag_is_carried(visit):
+    """Once it leaves its cell a flag is picked up; on a wall or beside the grid it is put back."""
+    page = visit()
+    board, cells = "#network-board", page.locator("#network-board .cells [data-cell]")
+    carried = page.locator(f"{board} .flag.carried")
+    for where, said in ((8, "cannot stand on a wall"), (None, "is back in its place")):
+        cells.nth(0).hover()
+        page.mouse.down()
+        assert carried.count() == 0
+        cells.nth(1).hover()
+        assert carried.count() > 0
+        assert "Flag A is picked up" in page.inner_text("#message")
+        if where is None:
+            page.mouse.move(2, 2)
+        else:
+            cells.nth(where).hover()
+        page.mouse.up()
+        assert carried.count() == 0
+        assert said in page.inner_text("#message")
+        assert flags_of(page) == FIRST
+    page.click("#step")
+    assert page.inner_text("#message") == ""
+
+
+def test_arrows_start_where_the_focus_is(visit):
+    """Whatever has put the focus on a cell, arrow keys go on from there."""
+    page = visit()
+    page.focus("#network-board [data-cell='32']")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("document.activeElement.dataset.cell") == "33"
+
+
 def test_other_buttons_drag_nothing(visit):
     """The right button's menu leaves the flags where they are."""
     page = visit()

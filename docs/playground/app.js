@@ -136,6 +136,14 @@
     return setFlags([...others, to], "");
   }
 
+  /** Put a dragged flag where it was released, or back. */
+  function drop(from, to) {
+    drag(from, to);
+    if (state.carried === null) return;
+    state.carried = null;
+    refresh();
+  }
+
   function remove(cell) {
     if (!state.flags.includes(cell)) return;
     setFlags(state.flags.filter((other) => other !== cell), `${name(cell)} is taken away.`);
@@ -236,6 +244,7 @@
   function play() {
     if (state.timer !== null) return pause();
     if (state.carried !== null) cancel();
+    say("");
     if (state.step >= state.last) goTo(0);
     return tick();
   }
@@ -249,6 +258,7 @@
 
   function jump(step, glide) {
     pause();
+    say("");
     goTo(step, glide);
   }
 
@@ -300,7 +310,7 @@
       for (const control of document.querySelectorAll("button, input, select")) control.disabled = true;
       return;
     }
-    const handlers = { press, drag, remove, cancel };
+    const handlers = { press, pickUp, drop, remove, cancel };
     boards = Object.fromEntries(
       ["network", "optimum"].map((name) => [name, new mapp.Board($(`${name}-board`), grid, handlers)]),
     );

@@ -20,7 +20,8 @@
 
   class Board {
     /**
-     * Fill an element. `handlers` has `press(cell)`, `drag(from, to)`, `remove(cell)`, `cancel()`.
+     * Fill an element. `handlers` has `press(cell)`, `pickUp(cell)`, `drop(from, to)`,
+     * `remove(cell)` and `cancel()`.
      */
     constructor(element, grid, handlers) {
       Object.assign(this, { element, grid, handlers, flags: [], carried: null, plan: null });
@@ -86,6 +87,7 @@
       }
       cells.addEventListener("click", (event) => this.onClick(event));
       cells.addEventListener("keydown", (event) => this.onKey(event));
+      cells.addEventListener("focusin", (event) => this.moveCursor(this.cellOf(event.target)));
       cells.addEventListener("pointerdown", (event) => this.onGrab(event));
       this.element.append(cells);
     }
@@ -133,23 +135,30 @@
       event.preventDefault();
     }
 
-    /** Drag a flag: what is released on another cell is put there. */
+    /** Drag a flag: it is carried once it leaves its cell, and put where it is released. */
     onGrab(event) {
       const from = this.cellOf(event.target);
       if (from === null || !this.flags.includes(from)) return;
       if (event.button !== 0 || !event.isPrimary) return; // menus are no drags
-      const release = (end) => {
-        window.removeEventListener("pointerup", release);
-        window.removeEventListener("pointercancel", release);
-        if (end.type !== "pointerup") return;
-        const to = this.cellOf(document.elementFromPoint(end.clientX, end.clientY));
-        if (to === null || to === from) return;
+      let lifted = false;
+      const under = ({ clientX, clientY }) => this.cellOf(document.elementFromPoint(clientX, clientY));
+      const move = (event) => {
+        if (lifted || under(event) === from) return;
+        lifted = true;
+        this.handlers.pickUp(from);
+      };
+      const release = (event) => {
+        window.removeEventListener("pointermove", move);
+        for (const end of ["pointerup", "pointercancel"]) window.removeEventListener(end, release);
+        const to = event.type === "pointerup" ? under(event) : null;
+        if (!lifted && (to === null || to === from)) return;
         this.dropped = true; // some browsers send a click after it
         setTimeout(() => (this.dropped = false), 0);
-        this.handlers.drag(from, to);
+        if (to === null || to === from) this.handlers.cancel();
+        else this.handlers.drop(from, to);
       };
-      window.addEventListener("pointerup", release);
-      window.addEventListener("pointercancel", release);
+      window.addEventListener("pointermove", move);
+      for (const end of ["pointerup", "pointercancel"]) window.addEventListener(end, release);
     }
 
     // -- what is shown -----------------------------------------------------------------------

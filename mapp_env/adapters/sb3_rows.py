@@ -44,8 +44,10 @@ class RowsVecEnv(VecEnv):
         return mask
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return the batch's attribute once for each row asked for."""
+        """Return the batch's attribute, or the spaces of a row, once for each row asked for."""
         rows = list(self._get_indices(indices))
+        if attr_name in ("observation_space", "action_space"):
+            return [getattr(self, attr_name)] * len(rows)  # the batch's are those of all rows
         if attr_name == MASKS:
             return [partial(self._mask_of, row) for row in rows]
         return [getattr(self._batch, attr_name)] * len(rows)

@@ -50,6 +50,8 @@ def main(command_line: Sequence[str] | None = None) -> int:
         prog=PROGRAM if os.path.basename(sys.argv[0]) == PROGRAM else "python -m mapp_env",
         description="Multi-agent path planning on walled grids, from the command line.",
     )
+    (version,) = info.versions_of(["mapp-env"]).values()
+    parser.add_argument("--version", action="version", version=f"mapp_env {version}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in COMMANDS:
         text = (command.__doc__ or "").strip()

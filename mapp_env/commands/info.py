@@ -14,16 +14,20 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable
 from importlib import metadata
 from typing import Any
 
 from mapp_env.commands.reports import add_json_option, print_report, words
 from mapp_env.compiled import cache_files, cache_folders
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["add_arguments", "run", "versions_of"]
 
 PACKAGES = ("mapp-env", "numpy", "numba", "gymnasium", "pettingzoo", "pillow")
-EXTRAS = ("matplotlib", "pygame-ce", "pyvrp", "torch", "supersuit", "stable-baselines3")
+EXTRAS = (
+    *("matplotlib", "pygame-ce", "pyvrp", "torch", "supersuit", "stable-baselines3"),
+    *("sb3-contrib", "torchrl", "ray"),
+)
 
 # In a process of its own: importing torch takes seconds, and a broken one must not take this along.
 ACCELERATOR = """
@@ -41,8 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Print what runs here."""
     record: dict[str, Any] = {
-        "versions": {"python": platform.python_version(), **_versions(PACKAGES)},
-        "extras": _versions(EXTRAS),
+        "versions": {"python": platform.python_version(), **versions_of(PACKAGES)},
+        "extras": versions_of(EXTRAS),
         "compiled_code": _compiled_code(),
         "device": {
             "platform": platform.platform(),
@@ -58,7 +62,7 @@ def run(arguments: argparse.Namespace) -> None:
     print_report(arguments, record, lines)
 
 
-def _versions(packages: tuple[str, ...]) -> dict[str, str | None]:
+def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
     """Return which versions are installed; none of them is imported."""
     found: dict[str, str | None] = {}
     for name in packages:
@@ -82,7 +86,7 @@ def _compiled_code() -> dict[str, Any]:
 
 def _accelerator() -> str | None:
     """Return what torch would compute on beside the processor; None without torch."""
-    if _versions(("torch",))["torch"] is None:
+    if versions_of(("torch",))["torch"] is None:
         return None
     done = subprocess.run(
         [sys.executable, "-c", ACCELERATOR], capture_output=True, text=True, check=False

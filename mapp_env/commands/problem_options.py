@@ -23,7 +23,17 @@ __all__ = [
 
 MAX_DRAWN = 2**63 - 1  # of seeds
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
-OPTIONS = ("problem", "grid", "rows", "cols", "grid_seed", "landmarks", "n_landmarks", "n_agents")
+OPTIONS = (
+    "problem",
+    "grid",
+    "depot",
+    "rows",
+    "cols",
+    "grid_seed",
+    "landmarks",
+    "n_landmarks",
+    "n_agents",
+)
 
 
 def add_grid_options(group: argparse._ArgumentGroup) -> None:
@@ -33,6 +43,13 @@ def add_grid_options(group: argparse._ArgumentGroup) -> None:
         metavar="GRID",
         help=f"a bundled grid ({', '.join(grid_names())}), a generator "
         f"({', '.join(generator_names())}) or a map file (default {GRID})",
+    )
+    group.add_argument(
+        "--depot",
+        type=_cell,
+        metavar="CELL",
+        help="of a map file that has none, or in place of its own (default: the free cell nearest "
+        "to the centre)",
     )
     group.add_argument("--rows", type=int, metavar="R", help="rows of a generated grid")
     group.add_argument("--cols", type=int, metavar="C", help="columns of a generated grid")
@@ -136,6 +153,9 @@ def grid_of(arguments: argparse.Namespace) -> Grid:
         )
         if value is not None
     }
+    depot = arguments.depot
+    if depot is not None and name in (*generator_names(), *grid_names()):
+        raise ValueError(f"--depot is for map files, not for {describe(name)}")
     if name in generator_names():
         return make_grid(name, **options)
     if options:
@@ -146,9 +166,9 @@ def grid_of(arguments: argparse.Namespace) -> Grid:
     if name not in grid_names() and not os.path.lexists(name):
         raise ValueError(
             f"--grid must be one of {', '.join((*grid_names(), *generator_names()))} or a map "
-            f"file, got {describe(name)}"
+            f"file, and there is no file {describe(name)}"
         )
-    return find_grid(name)
+    return find_grid(name) if depot is None else Grid.load(name, depot)
 
 
 def _cell(text: str) -> int | tuple[int, ...]:

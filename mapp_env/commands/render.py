@@ -30,7 +30,13 @@ from mapp_env.commands.problem_options import (
     refuse_problem_options,
     seed_of,
 )
-from mapp_env.commands.reports import add_json_option, costs_line, costs_record, print_report
+from mapp_env.commands.reports import (
+    add_json_option,
+    costs_line,
+    costs_record,
+    landmarks_line,
+    print_report,
+)
 from mapp_env.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers import solve
@@ -98,8 +104,17 @@ def run(arguments: argparse.Namespace) -> None:
     size = draw(problem, plan)
     print_report(
         arguments,
-        {"out": arguments.out, "bytes": size, **costs_record(plan)},
-        [f"wrote {arguments.out}: {size} bytes", costs_line(problem, plan)],
+        {
+            "out": arguments.out,
+            "bytes": size,
+            "landmarks": list(problem.landmarks),
+            **costs_record(plan),
+        },
+        [
+            f"wrote {arguments.out}: {size} bytes",
+            costs_line(problem, plan),
+            landmarks_line(problem),
+        ],
     )
 
 

@@ -11,7 +11,14 @@ from typing import Any
 from mapp_env.plan import OBJECTIVES, Plan
 from mapp_env.problem import Problem
 
-__all__ = ["add_json_option", "costs_line", "costs_record", "print_report", "words"]
+__all__ = [
+    "add_json_option",
+    "costs_line",
+    "costs_record",
+    "landmarks_line",
+    "print_report",
+    "words",
+]
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -44,6 +51,11 @@ def costs_line(problem: Problem, plan: Plan) -> str:
     if plan.bound is not None:
         return f"{costs}; the {words(plan.objective)} is at least {plan.bound}"
     return costs
+
+
+def landmarks_line(problem: Problem) -> str:
+    """Return where the landmarks are: who had them drawn does not know."""
+    return f"landmarks: {' '.join(map(str, problem.landmarks))}"
 
 
 def costs_record(plan: Plan) -> dict[str, Any]:

@@ -17,7 +17,12 @@ import argparse
 
 from mapp_env.commands.pictures import PICTURES, check_file, picture_writer
 from mapp_env.commands.problem_options import add_problem_options, problem_of, seed_of
-from mapp_env.commands.reports import add_json_option, costs_line, print_report
+from mapp_env.commands.reports import (
+    add_json_option,
+    costs_line,
+    landmarks_line,
+    print_report,
+)
 from mapp_env.files import labelled
 from mapp_env.plan import OBJECTIVES, Plan
 from mapp_env.solvers import METHODS, solve
@@ -79,7 +84,8 @@ def run(arguments: argparse.Namespace) -> None:
         draw(problem, plan)  # first, as more can stand in its way
     if arguments.out is not None:
         plan.save(arguments.out)
-    lines = [costs_line(problem, plan), *_tour_lines(plan), _made_line(plan)]
+    lines = [costs_line(problem, plan), landmarks_line(problem)]
+    lines += [*_tour_lines(plan), _made_line(plan)]
     lines += [f"wrote {name}" for name in (arguments.out, arguments.picture) if name is not None]
     print_report(arguments, labelled("plan", plan.to_record()), lines)
 
