@@ -90,6 +90,14 @@ def judge(act: Acting, landmarks: np.ndarray, **arguments: Any) -> Judgement:
     return Judgement(100 * float(solved.mean()), gap, float(returns.mean()))
 
 
+def check_options(seconds: float, n_problems: int) -> None:
+    """End the program, before it trains, if it could not be reported what comes of it."""
+    if not seconds > 0:
+        raise SystemExit(f"error: --seconds must be above 0, got {seconds}")
+    if n_problems < 1:
+        raise SystemExit(f"error: --problems must be 1 or more, got {n_problems}")
+
+
 def report(
     seconds: float, returns: Sequence[float], act: Acting, n_problems: int, **arguments: Any
 ) -> None:

@@ -22,7 +22,7 @@ import gymnasium
 import numpy as np
 import torch
 import tyro
-from beside_optimum import report
+from beside_optimum import check_options, report
 from torch import nn
 
 import mapp_env  # noqa: F401 - registers mapp_env/Tuple-v0
@@ -146,6 +146,7 @@ def play(
 
 def main(args: Args) -> None:
     """Train and print what was reached."""
+    check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)

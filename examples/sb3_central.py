@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
-from beside_optimum import report
+from beside_optimum import check_options, report
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -45,6 +45,7 @@ class Args:
 
 def main(args: Args) -> None:
     """Train and print what was reached."""
+    check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     envs = make_vec_env(
         "mapp_env/Central-v0",

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
-from beside_optimum import report
+from beside_optimum import check_options, report
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -44,6 +44,7 @@ class Args:
 
 def main(args: Args) -> None:
     """Train and print what was reached."""
+    check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     envs = make_sb3_vec(args.num_envs, observation="geodesic")
     model = PPO(

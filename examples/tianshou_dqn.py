@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import tyro
-from beside_optimum import report
+from beside_optimum import check_options, report
 from tianshou.algorithm import DQN
 from tianshou.algorithm.modelfree.dqn import DiscreteQLearningPolicy
 from tianshou.algorithm.multiagent.marl import MultiAgentOffPolicyAlgorithm
@@ -93,6 +93,7 @@ def make_learner(env: PettingZooEnv, args: Args) -> DQN:
 
 def main(args: Args) -> None:
     """Train and print what was reached."""
+    check_options(args.seconds, args.problems)
     # It says at each step that it flattens returns of several agents for its statistics.
     logging.getLogger("tianshou").setLevel(logging.ERROR)
     torch.set_num_threads(1)

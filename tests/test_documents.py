@@ -79,6 +79,20 @@ def test_example_runs(name: str, tmp_path: Path) -> None:
     assert run([sys.executable, str(REPOSITORY / "examples" / name), *arguments], tmp_path).strip()
 
 
+@pytest.mark.parametrize(
+    "name", ["sb3_central.py", "sb3_shared.py", "sb3_vec.py", "epymarl_style.py"]
+)
+def test_trainings_refuse_before_they_train(name: str, tmp_path: Path) -> None:
+    """What could not be reported on is refused in one line before a minute is spent on it."""
+    script = str(REPOSITORY / "examples" / name)
+    for option in ("--seconds", "--problems"):
+        done = subprocess.run(
+            [sys.executable, script, option, "0"], cwd=tmp_path, capture_output=True, text=True
+        )
+        assert done.returncode == 1
+        assert done.stderr.startswith(f"error: {option} must be")
+
+
 def test_rollout_writes_an_animation(tmp_path: Path) -> None:
     """The rollout's file is a GIF with a picture for the reset and one for each step."""
     target = tmp_path / "episode.gif"
