@@ -129,3 +129,9 @@ def browser() -> Iterator[Any]:
         running = driver.chromium.launch(executable_path=program, args=BROWSER_OPTIONS.split())
         yield running
         running.close()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def training_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Keep the folders in which Stable-Baselines3 logs each training with the tests' own."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
