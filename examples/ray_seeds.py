@@ -80,7 +80,8 @@ def train(trial: Trial, directory: Path) -> int:
         contextlib.redirect_stderr(log),
     ):
         print(f"process {os.getpid()} on {socket.gethostname()}")
-        os.chdir(directory)
+        with contextlib.suppress(FileNotFoundError):  # not needed where no option names a file
+            os.chdir(directory)
         wait_until_left(trial.folder)
         check_folder(trial)
         if trial.finished:

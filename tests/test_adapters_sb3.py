@@ -267,21 +267,32 @@ def test_clock_stops_a_training() -> None:
     assert model.num_timesteps >= 40
 
 
-FORMS: dict[str, Callable[[], Any]] = {
-    "multi": lambda: make_sb3_vec(3, n_landmarks=2, max_cycles=12),
-    "joint": lambda: make_sb3_vec(3, central_action="joint", n_landmarks=2, max_cycles=12),
-    "shared": lambda: make_sb3_shared(2, n_landmarks=2, max_cycles=12),
+FORMS: dict[str, Callable[..., Any]] = {
+    "multi": lambda **more: make_sb3_vec(3, n_landmarks=2, max_cycles=12, **more),
+    "joint": lambda **more: make_sb3_vec(
+        3, central_action="joint", n_landmarks=2, max_cycles=12, **more
+    ),
+    "shared": lambda **more: make_sb3_shared(2, n_landmarks=2, max_cycles=12, **more),
 }
 
 
+@pytest.mark.parametrize("allow_wait", [False, True])
 @pytest.mark.parametrize("form", FORMS)
-def test_masks_say_what_bumps(form: str) -> None:
-    """An action is masked if and only if a copy of the row that takes it leaves an agent behind."""
-    envs = FORMS[form]()
+def test_masks_say_what_bumps(form: str, allow_wait: bool) -> None:
+    """An action is masked if and only if it would leave an agent that moves where it is."""
+    envs = FORMS[form](allow_wait=allow_wait)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.action_masks()
     envs.seed(2)
     envs.reset()
     rng = np.random.default_rng(0)
     moves = mapp_v0.parallel_env().task.grid.moves
+    n_actions = 4 + allow_wait
+
+    def free_of(cells: np.ndarray) -> np.ndarray:
+        free = moves[cells] != cells[..., None]
+        return np.concatenate([free, np.ones((*cells.shape, int(allow_wait)), bool)], axis=-1)
+
     for _ in range(30):
         masks = np.stack(envs.env_method("action_masks"))
         assert masks.dtype == bool
@@ -289,17 +300,18 @@ def test_masks_say_what_bumps(form: str) -> None:
         assert np.array_equal(envs.get_attr("action_masks", indices=1)[0](), masks[1])
         if form == "shared":
             cells = np.array([env.par_env.state()[:3] for env in envs.venv.vec_envs], int)
-            expected = (moves[cells] != cells[..., None]).reshape(6, 4)
+            expected = free_of(cells).reshape(6, n_actions)
         else:
-            cells = last_cells(envs)
-            free = moves[cells] != cells[..., None]  # (B, N, A)
+            free = free_of(last_cells(envs))  # (B, N, A)
             if form == "multi":
-                expected = free.reshape(3, 12)
+                expected = free.reshape(3, 3 * n_actions)
             else:
-                every = np.array(list(itertools.product(range(4), repeat=3)))
+                every = np.array(list(itertools.product(range(n_actions), repeat=3)))
                 expected = np.array([[row[[0, 1, 2], j].all() for j in every] for row in free])
         assert np.array_equal(masks, expected)
-        envs.step(batched_actions(envs, rng))
+        for info in envs.step(batched_actions(envs, rng))[3]:
+            if "action_mask" in info:
+                info.pop("action_mask")[:] = 0  # what was given is the caller's
 
 
 def last_cells(envs: MappSb3VecEnv) -> np.ndarray:
@@ -330,10 +342,13 @@ def test_maskable_ppo_never_bumps(form: str) -> None:
 
 def test_central_environment_has_masks() -> None:
     """CentralEnv.action_masks says the same as the batch's, and asks for a reset first."""
+    from sb3_contrib.common.maskable.utils import is_masking_supported
+
     for central_action in ("multi", "joint"):
         env = CentralEnv(central_action=central_action)
         with pytest.raises(gymnasium.error.ResetNeeded):
             env.action_masks()
+        assert is_masking_supported(gymnasium.make("mapp_env/Central-v0"))
         envs = make_sb3_vec(1, central_action=central_action)
         env.reset(seed=envs.seed(3)[0])
         envs.reset()
@@ -378,7 +393,9 @@ def test_shared_environments_take_problems() -> None:
     """set_options gives the landmarks to the next reset of all environments, and to that alone."""
     envs = make_sb3_shared(2, n_landmarks=3)
     envs.seed(0)
-    envs.set_options({"landmarks": [0, 1, 42]})
+    landmarks = np.array([0, 1, 42])
+    envs.set_options({"landmarks": landmarks})
+    landmarks[:] = 7  # what was given is the caller's
     assert (envs.reset()[:, 3:6] == [0, 1, 42]).all()
     assert not (envs.reset()[:, 3:6] == [0, 1, 42]).all()
     assert (envs.reset()[:, :3] == envs.reset()[0, :3]).all()
@@ -399,6 +416,10 @@ def test_agents_that_share_a_network_see_who_they_are() -> None:
         (lambda: make_sb3_vec(0), "num_envs"),
         (lambda: make_sb3_vec(2).set_options([{}, {}]), "options"),
         (lambda: make_sb3_vec(2).set_options([{"landmarks": [0, 1, 2, 3, 5]}]), "options"),
+        (lambda: make_sb3_vec(2).set_options(np.zeros((2, 5), int)), "options"),
+        (lambda: make_sb3_vec(1).set_options([{"landmarks": None}]), r"options\[0\]"),
+        (lambda: make_sb3_vec(1).set_options([{"landmarks": [1] * 5}]), r"options\[0\]"),
+        (lambda: make_sb3_vec(1).set_options([{"landmarks": [0, 1, 2, 3, 5], "x": 1}]), "alone"),
         (lambda: make_sb3_vec(2).set_options({"reset_mask": np.ones(2, bool)}), "reset_mask"),
         (lambda: make_sb3_vec(2, render_mode="ansi"), "render_mode"),
         (lambda: make_sb3_shared(2).set_options([{}, {}]), "options"),
@@ -423,6 +444,7 @@ def test_rows_have_no_attributes_of_their_own() -> None:
     """get_attr gives the engine's attribute for each row; unknown names are an AttributeError."""
     envs: MappSb3VecEnv = make_sb3_vec(3)
     assert envs.get_attr("render_mode") == [None] * 3
+    assert envs.metadata["render_fps"] == make_sb3_shared(1).metadata["render_fps"] == 5
     assert envs.get_attr("num_envs", indices=[0, 2]) == [3, 3]
     assert envs.get_attr("action_space") == [envs.action_space] * 3
     assert envs.get_attr("observation_space") == [envs.observation_space] * 3

@@ -295,6 +295,8 @@ def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture
         ("render --out a.gif --policy nope", "pretrained, pretrained-distilled"),
         ("render --out a.gif --policy pretrained --n-landmarks 3", "--policy cannot play this"),
         ("solve --grid no/such.map", "no file 'no/such.map'"),
+        ("solve --grid bad.json", "--grid bad.json:1: "),
+        ("render --out a.gif --policy 2 --policy-loader broken:load", "broken:load cannot be imp"),
         ("universe --n-landmarks 9", "273,438,880 problems"),
         ("universe --n-landmarks 0", "--n-landmarks must be"),
         ("universe --n-agents 17", "--n-agents must be"),
@@ -308,6 +310,7 @@ def test_refusals_are_one_line(
 ) -> None:
     """Whatever is wrong gives exit status 2, one line that says what, and no file."""
     (folder / "bad.json").write_text("{", encoding="ascii")
+    (folder / "broken.py").write_text("open('no/weights')\n", encoding="ascii")
     try:
         status = main(line.split())
     except SystemExit as leaving:  # argparse's own way
@@ -315,7 +318,8 @@ def test_refusals_are_one_line(
     streams = capsys.readouterr()
     assert (status, streams.out) == (2, "")
     assert re.fullmatch(rf"error: [^\n]*({words})[^\n]*\n", streams.err), streams.err
-    assert [path.name for path in folder.iterdir()] == ["bad.json"]
+    names = {path.name for path in folder.iterdir()}
+    assert names - {"__pycache__"} == {"bad.json", "broken.py"}
 
 
 @pytest.mark.parametrize(

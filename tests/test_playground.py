@@ -303,6 +303,41 @@ def test_a_dragged_flag_is_carried(visit):
     assert page.inner_text("#message") == ""
 
 
+@pytest.mark.parametrize(("key", "left"), [("Escape", FIRST), ("Delete", FIRST[1:])])
+def test_a_key_ends_a_drag(key, left, visit):
+    """A flag that a key has put back or away while it was dragged is not put down any more."""
+    page = visit()
+    cells = page.locator("#network-board .cells [data-cell]")
+    cells.nth(0).focus()
+    cells.nth(0).hover()
+    page.mouse.down()
+    cells.nth(2).hover()
+    page.keyboard.press(key)
+    page.mouse.up()
+    assert flags_of(page) == left
+
+
+def test_only_the_first_finger_drags(visit):
+    """Another finger neither lifts nor drops the flag that the first one rests on."""
+    page = visit(has_touch=True)
+    touch = page.context.new_cdp_session(page)
+
+    def point(cell: int, finger: int) -> dict[str, float]:
+        box = page.locator("#network-board .cells [data-cell]").nth(cell).bounding_box()
+        middle = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        return {**middle, "id": finger}
+
+    def send(kind: str, *points: dict[str, float]) -> None:
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": list(points)})
+
+    send("touchStart", point(0, 0))
+    send("touchStart", point(0, 0), point(17, 1))
+    send("touchMove", point(0, 0), point(31, 1))
+    send("touchEnd", point(0, 0))
+    assert flags_of(page) == FIRST
+    assert page.locator("#network-board .flag.carried").count() == 0
+
+
 def test_arrows_start_where_the_focus_is(visit):
     """Whatever has put the focus on a cell, arrow keys go on from there."""
     page = visit()

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
+import subprocess
+import sys
 from collections import deque
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -565,3 +569,21 @@ def test_the_step_limit_is_the_episodes() -> None:
     plan = solve(Problem(grid, (0, 6, 20, 42, 48), 3, max_cycles=2))
     assert plan.cost == solve(Problem(grid, (0, 6, 20, 42, 48), 3)).cost == 12
     plan.verify()
+
+
+@pytest.mark.parametrize("method", ["exact", "search"])
+def test_compiling_is_not_counted(method: str, tmp_path: Path) -> None:
+    """The first plan of an installation takes the solver's time, not the compiler's."""
+    code = (
+        "import time; start = time.perf_counter(); import mapp_env;"
+        "problem = mapp_env.Problem(mapp_env.make_grid(), (0, 6, 20, 42, 48), 3);"
+        f"plan = mapp_env.solve(problem, method={method!r});"
+        "print(plan.seconds, time.perf_counter() - start)"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    counted, whole = map(float, done.stdout.split())
+    assert counted < whole / 5
+    assert whole > 1

@@ -115,6 +115,7 @@
   }
 
   function pickUp(cell) {
+    if (!state.flags.includes(cell)) return; // taken away since it was pressed
     pause();
     stopSearch();
     state.carried = cell;
@@ -136,8 +137,9 @@
     return setFlags([...others, to], "");
   }
 
-  /** Put a dragged flag where it was released, or back. */
+  /** Put a dragged flag where it was released, or back; not one put back or away meanwhile. */
   function drop(from, to) {
+    if (state.carried !== from) return;
     drag(from, to);
     if (state.carried === null) return;
     state.carried = null;
@@ -258,6 +260,7 @@
 
   function jump(step, glide) {
     pause();
+    if (state.carried !== null) cancel();
     say("");
     goTo(step, glide);
   }

@@ -140,22 +140,25 @@
       const from = this.cellOf(event.target);
       if (from === null || !this.flags.includes(from)) return;
       if (event.button !== 0 || !event.isPrimary) return; // menus are no drags
+      const finger = event.pointerId;
       let lifted = false;
       const under = ({ clientX, clientY }) => this.cellOf(document.elementFromPoint(clientX, clientY));
       const move = (event) => {
-        if (lifted || under(event) === from) return;
+        if (lifted || event.pointerId !== finger || under(event) === from) return;
         lifted = true;
         this.handlers.pickUp(from);
       };
       const release = (event) => {
+        if (event.pointerId !== finger) return;
         window.removeEventListener("pointermove", move);
         for (const end of ["pointerup", "pointercancel"]) window.removeEventListener(end, release);
         const to = event.type === "pointerup" ? under(event) : null;
         if (!lifted && (to === null || to === from)) return;
         this.dropped = true; // some browsers send a click after it
         setTimeout(() => (this.dropped = false), 0);
-        if (to === null || to === from) this.handlers.cancel();
-        else this.handlers.drop(from, to);
+        if (to === null || to === from) return this.handlers.cancel();
+        if (!lifted) this.handlers.pickUp(from); // released before it was seen to move
+        this.handlers.drop(from, to);
       };
       window.addEventListener("pointermove", move);
       for (const end of ["pointerup", "pointercancel"]) window.addEventListener(end, release);

@@ -52,7 +52,7 @@ class SharedVecEnv(RowsVecEnv):
         self.n_agents = n_agents
         self._seed: int | None = None
         self._wishes: dict[str, Any] | None = None
-        self._infos: list[dict[str, Any]] = []
+        self._masks: NDArray[np.bool_] | None = None  # (B, A), once there are episodes
         self._actions: Any = None
         super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
@@ -108,7 +108,8 @@ class SharedVecEnv(RowsVecEnv):
         found: Any
         observations, found = self.venv.reset(seed=self._seed, options=self._wishes)
         self._seed, self._wishes = None, None
-        self._infos = self.reset_infos = list(found)
+        self.reset_infos = list(found)
+        self._keep_masks(found)
         return np.array(observations)
 
     def step_async(self, actions: NDArray[np.int64]) -> None:
@@ -136,7 +137,7 @@ class SharedVecEnv(RowsVecEnv):
         dones = terminations | truncations
         for row in np.flatnonzero(dones).tolist():
             infos[row]["is_success"] = bool(terminations[row])
-        self._infos = infos
+        self._keep_masks(infos)
         return np.array(observations), np.array(rewards), dones, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -151,9 +152,13 @@ class SharedVecEnv(RowsVecEnv):
         gymnasium.error.ResetNeeded
             Before the first reset.
         """
-        if not self._infos:
+        if self._masks is None:
             raise ResetNeeded("action_masks() needs episodes: call reset() first")
-        return np.stack([info["action_mask"] for info in self._infos]).astype(np.bool_)
+        return self._masks.copy()
+
+    def _keep_masks(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Keep a copy of the masks: infos are the caller's."""
+        self._masks = np.stack([info["action_mask"] for info in infos]).astype(np.bool_)
 
 
 def make_sb3_shared(num_envs: int, **arguments: Any) -> SharedVecEnv:

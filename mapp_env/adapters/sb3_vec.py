@@ -8,6 +8,7 @@ from copy import deepcopy
 from typing import Any, NoReturn
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
@@ -51,7 +52,8 @@ class MappSb3VecEnv(RowsVecEnv):
     - ``TimeLimit.truncated``: whether the step limit ended it, so that its value is bootstrapped;
     - ``is_success``: whether all landmarks were visited, for the logged success rate;
     - ``metrics``: success, cover_time, makespan and total_distance;
-    - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them.
+    - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them, so that
+      no ``VecMonitor`` is needed.
 
     Infos of the other rows are one empty dict that cannot be written into. Action masks are
     :meth:`action_masks`.
@@ -91,8 +93,7 @@ class MappSb3VecEnv(RowsVecEnv):
         self._seed: int | None = None
         self._wishes: dict[str, Any] = {}
         self._actions: Any = None
-        task = self.engine.task
-        self._masks = np.zeros((num_envs, task.n_agents, task.n_actions), np.int8)
+        self._masks: NDArray[np.int8] | None = None  # (B, N, A), once there are episodes
         self._returns = np.zeros(self.engine.num_envs)
         self._lengths = np.zeros(self.engine.num_envs, np.int64)
         self._started = time.perf_counter()
@@ -142,18 +143,29 @@ class MappSb3VecEnv(RowsVecEnv):
                 raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
             self._wishes = deepcopy(dict(options or {}))
             return
-        try:
-            each = [row["landmarks"] for row in options]
-        except (KeyError, TypeError):
-            each = []
-        if len(each) != self.num_envs:
+        self._wishes = {"landmarks": np.array(self._landmarks_by_row(options))}
+
+    def _landmarks_by_row(self, options: Any) -> list[tuple[int, ...]]:
+        """Return the landmarks of a list of options, one a row."""
+        if not isinstance(options, Sequence) or len(options) != self.num_envs:
             raise ValueError(
                 f"options must be a dict, or a list of {self.num_envs} dicts with 'landmarks', one "
                 f"a row, got {describe(options)}"
             )
-        problems = [self.engine.task.check_options({"landmarks": cells}) for cells in each]
-        cells = [problem.landmarks for problem in problems if problem is not None]
-        self._wishes = {"landmarks": np.array(cells)}
+        found = []
+        for row, wishes in enumerate(options):
+            if not isinstance(wishes, Mapping) or set(wishes) != {"landmarks"}:
+                raise ValueError(
+                    f"options[{row}] must be a dict with 'landmarks' alone, got {describe(wishes)}"
+                )
+            try:
+                problem = self.engine.task.check_options(dict(wishes))
+            except ValueError as error:
+                raise ValueError(f"options[{row}]: {error}") from error
+            if problem is None:
+                raise ValueError(f"options[{row}]['landmarks'] must be cells, got None")
+            found.append(problem.landmarks)
+        return found
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every row; return the observations, shape (B, ...).
@@ -242,8 +254,14 @@ class MappSb3VecEnv(RowsVecEnv):
         Returns
         -------
         ndarray of bool, shape (B, N * A) or, with ``central_action="joint"``, (B, A**N)
-            All False before the first reset.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first reset.
         """
+        if self._masks is None:
+            raise ResetNeeded("action_masks() needs episodes: call reset() first")
         return central_action_masks(self._masks, self.engine.joint_actions)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:

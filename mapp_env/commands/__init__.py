@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from mapp_env.commands import info, render, solve, universe
+from mapp_env.commands.reports import OutputError
 
 __all__ = ["COMMANDS", "main"]
 
@@ -70,15 +71,13 @@ def main(command_line: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(command_line)
     try:
         arguments.run(arguments)
-        if sys.stdout is not None:  # as it is where it was closed before the start
-            sys.stdout.flush()
     except BrokenPipeError:
         _drop_output()  # nobody reads on
     except (ValueError, ImportError) as error:
         return _refuse(_name_option(str(error), arguments))
-    except OSError as error:
+    except OutputError as error:
         _drop_output()
-        return _refuse(f"the standard output cannot be written: {error}")
+        return _refuse(str(error))
     except KeyboardInterrupt:
         return INTERRUPTED
     return 0
@@ -91,9 +90,9 @@ def _refuse(message: str) -> int:
 
 
 def _name_option(message: str, arguments: argparse.Namespace) -> str:
-    """Return a message of the package, which begins with an argument's name, for the option."""
-    name, space, rest = message.partition(" ")
-    return f"--{name.replace('_', '-')}{space}{rest}" if name in arguments else message
+    """Return a message of the package, "n_agents must be ...", for the option."""
+    name, must, rest = message.partition(" must ")
+    return f"--{name.replace('_', '-')}{must}{rest}" if must and name in arguments else message
 
 
 def _drop_output() -> None:

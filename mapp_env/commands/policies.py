@@ -63,6 +63,8 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
             else ""
         )
         raise ImportError(f"policies are loaded by {loader}, but: {error}{hint}") from error
+    except Exception as error:  # whatever it is, it is the loader's, not ours
+        raise ValueError(f"--policy-loader {loader} cannot be imported: {error!r}") from error
     try:
         policy: Policy = load(name)
     except Exception as error:  # whatever it is, it is the loader's, not ours
@@ -108,7 +110,8 @@ def _act(policy: Policy, observation: NDArray[np.float32], n_agents: int) -> NDA
         raise ValueError(f"--policy cannot play this problem: {reason}") from error
     if found.shape != (1, n_agents) or found.dtype.kind not in "iu":
         raise ValueError(
-            f"--policy must act with integers of shape (1, {n_agents}), got {describe(found)}"
+            f"--policy must act with integers of shape (1, {n_agents}), got shape {found.shape}, "
+            f"dtype {found.dtype}"
         )
     actions: NDArray[np.int64] = found[0].astype(np.int64)
     return actions

@@ -168,7 +168,12 @@ def grid_of(arguments: argparse.Namespace) -> Grid:
             f"--grid must be one of {', '.join((*grid_names(), *generator_names()))} or a map "
             f"file, and there is no file {describe(name)}"
         )
-    return find_grid(name) if depot is None else Grid.load(name, depot)
+    if name in grid_names():
+        return find_grid(name)
+    try:
+        return Grid.load(name, depot)
+    except ValueError as error:
+        raise ValueError(f"--grid {error}") from error
 
 
 def _cell(text: str) -> int | tuple[int, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from mapp_env.plan import OBJECTIVES, Plan
 from mapp_env.problem import Problem
 
 __all__ = [
+    "OutputError",
     "add_json_option",
     "costs_line",
     "costs_record",
@@ -19,6 +21,10 @@ __all__ = [
     "print_report",
     "words",
 ]
+
+
+class OutputError(Exception):
+    """What was found out cannot be printed."""
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +37,21 @@ def add_json_option(parser: argparse.ArgumentParser) -> None:
 def print_report(
     arguments: argparse.Namespace, record: dict[str, Any], lines: Sequence[str]
 ) -> None:
-    """Print what a command found out, as the user asked for it."""
-    print(json.dumps(record, allow_nan=False) if arguments.json else "\n".join(lines))
+    """Print what a command found out, as the user asked for it.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written; BrokenPipeError if nobody reads it.
+    """
+    try:
+        print(json.dumps(record, allow_nan=False) if arguments.json else "\n".join(lines))
+        if sys.stdout is not None:  # as it is where it was closed before the start
+            sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(f"the standard output cannot be written: {error}") from error
 
 
 def words(name: str) -> str:

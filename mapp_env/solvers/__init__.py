@@ -10,7 +10,7 @@ from mapp_env.grid import Grid
 from mapp_env.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers.batch import optimal_costs
-from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
+from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, check_exact, solve_exact
 from mapp_env.solvers.solution import Routes, Solution, Solver
 from mapp_env.solvers.universe import solve_universe
 from mapp_env.solvers.vrplib import save_vrplib
@@ -76,6 +76,8 @@ def solve(
         hurried = limit is not None and limit < 2
         quick = QUICK_LANDMARKS if hurried else MAX_EXACT_LANDMARKS
         method = "exact" if len(problem.landmarks) <= quick else "search"
+    if method == "exact":
+        check_exact(problem)  # before anything is compiled
     _load_compiled(method)
     start = time.perf_counter()
     solution = _solver(method)(problem, objective, time_limit=limit, seed=seed)

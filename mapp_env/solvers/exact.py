@@ -33,6 +33,22 @@ MAX_EXACT_LANDMARKS = 20
 """Largest number of landmarks: the table of routes takes 80 MiB then."""
 
 
+def check_exact(problem: Problem) -> None:
+    """Refuse problems that are too large to be proven.
+
+    Raises
+    ------
+    ValueError
+        If it has more than 20 landmarks.
+    """
+    n_landmarks = len(problem.landmarks)
+    if n_landmarks > MAX_EXACT_LANDMARKS:
+        raise ValueError(
+            f"method 'exact' takes at most {MAX_EXACT_LANDMARKS} landmarks, this problem has "
+            f"{n_landmarks}: use method='search'"
+        )
+
+
 def solve_exact(
     problem: Problem, objective: str, *, time_limit: float | None = None, seed: int = 0
 ) -> Solution:
@@ -57,12 +73,8 @@ def solve_exact(
     ValueError
         If there are more landmarks; nothing has been allocated then.
     """
+    check_exact(problem)
     n_landmarks = len(problem.landmarks)
-    if n_landmarks > MAX_EXACT_LANDMARKS:
-        raise ValueError(
-            f"method 'exact' takes at most {MAX_EXACT_LANDMARKS} landmarks, this problem has "
-            f"{n_landmarks}: use method='search'"
-        )
     order = np.argsort(problem.landmarks)
     nodes = np.concatenate(([0], order + 1))
     distances = np.ascontiguousarray(landmark_distances(problem)[np.ix_(nodes, nodes)])
