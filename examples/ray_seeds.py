@@ -98,21 +98,21 @@ def wait_until_left(folder: Path) -> None:
             pass
 
 
-def start_ray(args: Args) -> None:
-    """Connect to the cluster, or start Ray here."""
+def start_ray(address: str | None, jobs: int, max_retries: int) -> None:
+    """Connect to a cluster, or start Ray here."""
     here = {
-        "num_cpus": args.jobs,
+        "num_cpus": jobs,
         "object_store_memory": OBJECT_STORE_BYTES,
         "include_dashboard": False,
-        "_system_config": {"task_oom_retries": args.max_retries},
+        "_system_config": {"task_oom_retries": max_retries},
     }
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     ray.init(
-        args.address or "local",
+        address or "local",
         log_to_driver=False,
         runtime_env={"env_vars": variables},
-        **(here if args.address is None else {}),
+        **(here if address is None else {}),
     )
 
 
@@ -167,7 +167,7 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
     trials = compare.plan_trials(args, words)
     make_folder(args.out)
     signals = StopSignals()
-    start_ray(args)
+    start_ray(args.address, args.jobs, args.max_retries)
     try:
         with signals:
             failures = train_all(trials, args.max_retries, signals)

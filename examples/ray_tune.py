@@ -36,6 +36,7 @@ import tyro
 from ray import tune
 from ray.tune.schedulers import ASHAScheduler
 from ray.tune.search.basic_variant import BasicVariantGenerator
+from ray_seeds import start_ray
 
 from baselines.checks import check_count
 from baselines.evaluation import Evaluation, evaluate, find_optima, unseen_problems
@@ -48,10 +49,10 @@ from baselines.runs import WEIGHTS_FILE
 from baselines.settings import Setting, find_grid
 from baselines.training import Streams, Training
 
-ROOT = Path(__file__).resolve().parents[1]
 METRIC = "excess %"
 TUNING_SEED = 1  # of the held-out problems
 BATCHES = (256, 512, 1024)
+MAX_RETRIES = 2
 GRACE = 5  # problems before a trial may be stopped
 
 
@@ -186,7 +187,7 @@ def search(args: Args) -> "tune.ResultGrid":
             name=f"{time.strftime('%Y%m%d-%H%M%S')}",
             storage_path=str(args.out.resolve()),
             checkpoint_config=tune.CheckpointConfig(num_to_keep=1),
-            failure_config=tune.FailureConfig(max_failures=2),
+            failure_config=tune.FailureConfig(max_failures=MAX_RETRIES),
             verbose=0,
         ),
     ).fit()
@@ -229,28 +230,11 @@ def final_figures(args: Args, result: "tune.Result") -> str:
     return ", ".join(f"{name} {found[name]:.2f}" for name in ("solved %", "gap %", "optimal %"))
 
 
-def start_ray(args: Args) -> None:
-    """Connect to the cluster, or start Ray here."""
-    here = {
-        "num_cpus": args.jobs,
-        "object_store_memory": 200_000_000,
-        "include_dashboard": False,
-    }
-    paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-    variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    ray.init(
-        args.address or "local",
-        log_to_driver=False,
-        runtime_env={"env_vars": variables},
-        **(here if args.address is None else {}),
-    )
-
-
 def main(args: Args) -> None:
     """Search, and print what was found."""
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
-    start_ray(args)
+    start_ray(args.address, args.jobs, MAX_RETRIES)
     started = time.monotonic()
     try:
         results = search(args)

@@ -5,19 +5,16 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium import logger
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from numpy.typing import NDArray
 
-from mapp_env.display import Display
 from mapp_env.grid import Grid
+from mapp_env.gymnasium_env import SimulationEnv
 from mapp_env.observation import Observation
-from mapp_env.simulation import Simulation
-from mapp_env.task import RENDER_MODES, Task, find_grid
-from mapp_env.validation import MAX_SEED, as_integer, check_choice, check_count, describe
+from mapp_env.task import Task, find_grid
+from mapp_env.validation import as_integer, check_choice, describe
 
 __all__ = [
     "CENTRAL_ACTIONS",
@@ -94,7 +91,7 @@ def central_action_masks(
     return every
 
 
-class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
+class CentralEnv(SimulationEnv):
     """The problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
 
     It sees what all agents see: the global observation once, or for the other kinds the agents'
@@ -114,8 +111,6 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
     ValueError
         If an argument is not as said.
     """
-
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 5}  # noqa: RUF012
 
     def __init__(
         self,
@@ -139,15 +134,11 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
             allow_wait,
             render_mode,
         )
-        self.task = task
-        self.render_mode = task.render_mode
+        self._once = task.observation_kind == Observation.GLOBAL
+        super().__init__(task, 1 if self._once else task.n_agents)
         view = task.central_view
         self.observation_space = Box(view.low, view.high, dtype=np.float32)
         self.action_space, self._joint_actions = central_action_space(task, central_action)
-        self._once = task.observation_kind == Observation.GLOBAL
-        self._simulation = Simulation(task, 1 if self._once else task.n_agents)
-        self._started = False
-        self._display = Display(task.render_mode, self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -159,15 +150,7 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         ValueError
             If seed or options cannot be used.
         """
-        if seed is not None:
-            seed = check_count("seed", seed, 0, MAX_SEED)
-        problem = self.task.check_options(options)
-        super().reset(seed=seed)
-        self._simulation.reset(problem, self.np_random)
-        self._started = True
-        if self.render_mode == "human":
-            self.render()
-        views, masks = self._simulation.observe()
+        views, masks = self._start(seed, options)
         return self._seen(views), {"action_mask": masks}
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
@@ -180,15 +163,10 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
         gymnasium.error.ResetNeeded
             If there is no episode to step.
         """
-        if not self._simulation.running:
-            raise ResetNeeded("step() needs an episode in progress: call reset() first")
-        joint_action = self._read_action(action)
-        reward, terminated, truncated, views, masks = self._simulation.step(joint_action)
+        reward, terminated, truncated, views, masks = self._play(action)
         info: dict[str, Any] = {"action_mask": masks}
         if terminated or truncated:
             info["metrics"] = self._simulation.metrics()
-        if self.render_mode == "human":
-            self.render()
         return self._seen(views), reward, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -234,21 +212,3 @@ class CentralEnv(gymnasium.Env[NDArray[np.float32], Any]):
     def _seen(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return what the meta-agent sees of the agents' views, shape (V, ...)."""
         return views[0] if self._once else views
-
-    def render(self) -> Any:
-        """Show the episode as ``render_mode`` says; see the PettingZoo face.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
-        """
-        if not self._started:
-            raise ResetNeeded("render() needs an episode: call reset() first")
-        if self.render_mode is None:
-            logger.warn("render() shows nothing: make the environment with a render_mode")
-        return self._display.show(self._simulation.scene())
-
-    def close(self) -> None:
-        """Close the window, if there is one; may be called again."""
-        self._display.close()

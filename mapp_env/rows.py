@@ -1,4 +1,4 @@
-"""Problems in progress: the state of B rows, and the loops that run the rules over them."""
+"""Problems in progress: the state of B rows."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.compiled import kernel
-from mapp_env.dynamics import measure_row, reset_row, row_length, step_row
-from mapp_env.grid import fill_distances
-from mapp_env.observation import observe_row
-from mapp_env.problem import draw_landmarks
+from mapp_env.dynamics import row_length
+from mapp_env.row_loops import fill_fields, measure_rows, observe_rows, reset_rows, step_rows
 from mapp_env.scene import TRAIL_MOVES, Scene
 from mapp_env.task import Task
 
-__all__ = ["Rows", "find_bad_action", "step_and_observe"]
+__all__ = ["Rows"]
 
 
 class Rows:
@@ -95,7 +92,7 @@ class Rows:
             landmarks = np.empty((len(indices), task.n_landmarks), np.int32)
         else:
             words = None
-        _reset_rows(
+        reset_rows(
             self.state,
             indices,
             np.empty(0, np.uint64) if words is None else words,
@@ -106,7 +103,7 @@ class Rows:
         )
         if task.needs_fields:
             queue = np.empty(task.grid.n_cells, np.int32)
-            _fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
+            fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
         self.limits[indices] = task.max_cycles if limit is None else limit
         if self._trails is not None:
             for index in indices:
@@ -143,7 +140,7 @@ class Rows:
         truncations = np.empty(self.n_rows, np.bool_)
         views = np.empty((self.n_rows, *self.views_shape), np.float32)
         masks = np.empty((self.n_rows, *self.masks_shape), np.int8)
-        _step_rows(
+        step_rows(
             self.state,
             actions,
             skip,
@@ -169,7 +166,7 @@ class Rows:
         indices = self._every_row if indices is None else indices
         views = np.empty((len(indices), *self.views_shape), np.float32)
         masks = np.empty((len(indices), *self.masks_shape), np.int8)
-        _observe_rows(
+        observe_rows(
             self.state,
             indices,
             *self.sizes,
@@ -184,7 +181,7 @@ class Rows:
     def measure(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return cover time, makespan and total distance (R8), inf if unsolved, shape (M, 3)."""
         costs = np.empty((len(indices), 3))
-        _measure_rows(self.state, indices, *self.sizes, self.task.table, costs)
+        measure_rows(self.state, indices, *self.sizes, self.task.table, costs)
         return costs
 
     def extend_trails(self, indices: NDArray[np.int64]) -> None:
@@ -210,210 +207,3 @@ class Rows:
             step=row[task.state_length],
             max_cycles=int(self.limits[index]),
         )
-
-
-@kernel
-def step_and_observe(
-    row: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    max_cycles: int,
-    n_agents: int,
-    n_landmarks: int,
-    reward: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    view_distances: NDArray[np.int32],
-    first_view_field: int,
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
-) -> tuple[float, bool, bool]:
-    """Step a row and look at it; parameters as in ``step_row`` and ``observe_row``."""
-    result: tuple[float, bool, bool] = step_row(
-        row,
-        actions,
-        n_agents,
-        n_landmarks,
-        max_cycles,
-        reward,
-        table,
-        distances,
-        first_field,
-    )
-    observe_row(
-        row,
-        n_agents,
-        n_landmarks,
-        kind,
-        table,
-        view_distances,
-        first_view_field,
-        views,
-        masks,
-    )
-    return result
-
-
-@kernel
-def _step_rows(
-    rows: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    skip: NDArray[np.bool_],
-    limits: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    reward: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    view_distances: NDArray[np.int32],
-    first_view_field: int,
-    rewards: NDArray[np.float64],
-    terminations: NDArray[np.bool_],
-    truncations: NDArray[np.bool_],
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
-) -> None:
-    for index in range(rows.shape[0]):
-        field = _field_of(index, first_field, n_landmarks)
-        view_field = _field_of(index, first_view_field, n_landmarks)
-        if skip[index]:
-            rewards[index] = 0.0
-            terminations[index] = False
-            truncations[index] = False
-            observe_row(
-                rows[index],
-                n_agents,
-                n_landmarks,
-                kind,
-                table,
-                view_distances,
-                view_field,
-                views[index],
-                masks[index],
-            )
-        else:
-            rewards[index], terminations[index], truncations[index] = step_and_observe(
-                rows[index],
-                actions[index],
-                limits[index],
-                n_agents,
-                n_landmarks,
-                reward,
-                kind,
-                table,
-                distances,
-                field,
-                view_distances,
-                view_field,
-                views[index],
-                masks[index],
-            )
-
-
-@kernel
-def _observe_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
-) -> None:
-    for place, index in enumerate(indices):
-        field = _field_of(index, first_field, n_landmarks)
-        observe_row(
-            rows[index],
-            n_agents,
-            n_landmarks,
-            kind,
-            table,
-            distances,
-            field,
-            views[place],
-            masks[place],
-        )
-
-
-@kernel
-def _field_of(index: int, first_field: int, n_landmarks: int) -> int:
-    """Return what a row takes for ``first_field``: a line of its own if there are fields."""
-    return first_field if first_field < 0 else index * n_landmarks
-
-
-@kernel
-def _reset_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    words: NDArray[np.uint64],
-    landmarks: NDArray[np.int32],
-    candidates: NDArray[np.int32],
-    depot: int,
-    n_agents: int,
-    n_landmarks: int,
-) -> None:
-    """Reset rows on given landmarks, or, where there are words, on landmarks drawn with them."""
-    for place, index in enumerate(indices):
-        if words.shape[0] > 0:
-            draw_landmarks(words[place], candidates, landmarks[place])
-        reset_row(rows[index], landmarks[place], depot, n_agents, n_landmarks)
-
-
-@kernel
-def _measure_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
-    costs: NDArray[np.float64],
-) -> None:
-    for place, index in enumerate(indices):
-        cover_time, makespan, distance = measure_row(rows[index], n_agents, n_landmarks, table)
-        costs[place, 0] = cover_time
-        costs[place, 1] = makespan
-        costs[place, 2] = distance
-
-
-@kernel
-def _fill_fields(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    table: NDArray[np.int32],
-    n_agents: int,
-    n_landmarks: int,
-    fields: NDArray[np.int32],
-    queue: NDArray[np.int32],
-) -> None:
-    """Write the steps from every landmark of some rows: how grids too large for all pairs do it.
-
-    Shapes: ``rows`` (B, row_length), ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,).
-    """
-    for index in indices:
-        for landmark in range(n_landmarks):
-            start = rows[index, n_agents + landmark]
-            fill_distances(table, start, fields[index * n_landmarks + landmark], queue)
-
-
-@kernel
-def find_bad_action(actions: NDArray[np.uint64], n_actions: int) -> int:
-    """Return the position of the first action outside ``0..n_actions - 1``, or -1.
-
-    Shape: ``actions`` (M,), int64 seen as uint64, so that a negative action is a huge one.
-    """
-    limit = np.uint64(n_actions)
-    highest = np.uint64(0)
-    for action in actions:
-        # No early exit: the loop without one is vectorised, and bad actions are rare.
-        highest = max(highest, action)
-    if highest >= limit:
-        for position, action in enumerate(actions):
-            if action >= limit:
-                return position
-    return -1

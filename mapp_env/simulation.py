@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.problem import Problem
-from mapp_env.rows import Rows, step_and_observe
+from mapp_env.row_loops import step_and_observe
+from mapp_env.rows import Rows
 from mapp_env.scene import Scene
 from mapp_env.task import Task
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,12 @@ from mapp_env.central_env import CentralEnv, central_action_space
 from mapp_env.display import Display
 from mapp_env.grid import Grid
 from mapp_env.observation import Observation
-from mapp_env.problem import check_landmarks
+from mapp_env.reset_options import check_problems, check_reset_mask
+from mapp_env.row_loops import find_bad_action
 from mapp_env.row_seeds import RowSeeds
-from mapp_env.rows import Rows, find_bad_action
+from mapp_env.rows import Rows
 from mapp_env.task import Task, find_grid
-from mapp_env.validation import check_choice, check_count, describe
+from mapp_env.validation import check_choice, check_count
 from mapp_env.vector_infos import Transition, make_infos
 
 try:
@@ -175,10 +176,10 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             If seed or options cannot be used; nothing has been reset then.
         """
         seeds = self._seeds.check(seed)
-        mask = self._check_reset_mask(options)
+        mask = check_reset_mask(options, self.num_envs)
         if not self._started and not mask.all():
             raise ValueError("options['reset_mask'] must be all True in the first reset")
-        landmarks, limit = self._check_problems(options)
+        landmarks, limit = check_problems(options, self.task, self.num_envs)
         indices = np.flatnonzero(mask)
         self._seeds.seed(seeds, indices.tolist())
         if landmarks is None:
@@ -265,7 +266,9 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self._ended = terminations | truncations
         ended = np.flatnonzero(self._ended)
         restarted = mode == AutoresetMode.SAME_STEP
-        endings = self._no_endings  # of few rows, most steps have none: a fifth of their time
+        endings = (
+            self._no_endings
+        )  # of few rows most steps have none, and to look for them takes longest
         if len(ended):
             endings = self._rows.measure(ended), observations[ended], masks[ended]
             if restarted:
@@ -308,56 +311,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"got {np.asarray(actions).flat[bad]}"
             )
         return array if self.joint_actions is None else self.joint_actions[array]
-
-    def _check_reset_mask(self, options: Mapping[str, Any] | None) -> NDArray[np.bool_]:
-        """Return which rows to reset, shape (B,), the caller's array untouched."""
-        if options is not None and not isinstance(options, Mapping):
-            raise ValueError(f"options must be a dict or None, got {describe(options)}")
-        mask = None if options is None else options.get("reset_mask")
-        if mask is None:
-            return np.ones(self.num_envs, np.bool_)
-        valid = isinstance(mask, np.ndarray) and mask.dtype == np.bool_
-        if not valid or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(
-                f"options['reset_mask'] must be a bool array of shape ({self.num_envs},) with at "
-                f"least one True, got {describe(mask)}"
-            )
-        return np.array(mask, np.bool_)
-
-    def _check_problems(
-        self, options: Mapping[str, Any] | None
-    ) -> tuple[NDArray[np.int32] | None, int | None]:
-        """Return the landmarks that ``options`` ask for, shape (B, K), and the step limit."""
-        landmarks = None if options is None else options.get("landmarks")
-        if isinstance(landmarks, np.ndarray) and landmarks.ndim == 2:
-            n_landmarks = self.task.n_landmarks
-            if landmarks.shape == (self.num_envs, n_landmarks):
-                if landmarks.shape == (n_landmarks, 2):
-                    raise ValueError(
-                        "options['landmarks'] of shape (2, 2) may mean a cell for each of 2 rows "
-                        "or (row, col) pairs: pass pairs as a list, or reset row by row"
-                    )
-                return self._check_landmarks(landmarks), None
-        problem = self.task.check_options(options)
-        if problem is None:
-            return None, None
-        cells = np.array(problem.landmarks, np.int32)
-        return np.repeat(cells[None], self.num_envs, axis=0), problem.max_cycles
-
-    def _check_landmarks(self, landmarks: NDArray[Any]) -> NDArray[np.int32]:
-        """Return landmarks of each row, shape (B, K), if they satisfy rule R2."""
-        grid = self.task.grid
-        ok = landmarks.dtype.kind in "iu"
-        if ok:
-            ordered = np.sort(landmarks, axis=1)
-            allowed = np.isin(landmarks, grid.reachable).all(axis=1)
-            distinct = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
-            ok = bool((allowed & distinct).all())
-        if not ok:
-            # Row by row, for the message that says which cell of which row is wrong and why.
-            for index, cells in enumerate(landmarks):
-                check_landmarks(grid, cells, name=f"options['landmarks'][{index}]")
-        return landmarks.astype(np.int32)
 
     # -- pictures ----------------------------------------------------------------------
 

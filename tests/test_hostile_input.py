@@ -18,7 +18,7 @@ import pytest
 
 import mapp_env
 from mapp_env import mapp_v0
-from mapp_env.rows import step_and_observe
+from mapp_env.row_loops import step_and_observe
 
 GRID = mapp_env.make_grid("paper-7x7")
 PROBLEM = mapp_env.Problem(GRID, (0, 6, 20, 42, 48))

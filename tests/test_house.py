@@ -27,16 +27,17 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("playing", "tour_checks", "walking"),
     ("plan",),
     ("solvers", "rendering.rivals", "rendering.comparison"),
-    ("rows", "row_seeds", "vector_infos", "display"),
+    ("row_loops",),
+    ("rows", "row_seeds", "reset_options", "vector_infos", "display"),
     ("simulation",),
-    ("rendering.animation", "rendering.side_by_side"),
+    ("rendering.animation", "rendering.side_by_side", "gymnasium_env"),
     ("parallel_env", "central_env", "vector_env"),
     ("mapp_v0", "adapters"),
     ("__init__",),
     ("commands",),
     ("__main__",),
 )
-FACES = {"parallel_env", "central_env", "vector_env", "mapp_v0", "__init__"}
+FACES = {"parallel_env", "gymnasium_env", "central_env", "vector_env", "mapp_v0", "__init__"}
 DRAWING = {"PIL", "matplotlib", "pygame"}
 TRAINERS = {"stable_baselines3", "supersuit"}
 

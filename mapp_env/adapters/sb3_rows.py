@@ -31,9 +31,14 @@ class RowsVecEnv(VecEnv):
 
     def __init__(self, batch: Any, name: str, observation_space: Any, action_space: Any) -> None:
         self._batch, self._name = batch, name
+        self._actions: Any = None
         super().__init__(batch.num_envs, observation_space, action_space)
         # For recorders of films, which take 30 a second where nothing is said.
         self.metadata = {**self.metadata, "render_fps": batch.metadata["render_fps"]}
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Keep the rows' actions, shape (B, ...), for :meth:`step_wait`."""
+        self._actions = actions
 
     @abstractmethod
     def action_masks(self) -> NDArray[np.bool_]:

@@ -53,7 +53,6 @@ class SharedVecEnv(RowsVecEnv):
         self._seed: int | None = None
         self._wishes: dict[str, Any] | None = None
         self._masks: NDArray[np.bool_] | None = None  # (B, A), once there are episodes
-        self._actions: Any = None
         super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -111,10 +110,6 @@ class SharedVecEnv(RowsVecEnv):
         self.reset_infos = list(found)
         self._keep_masks(found)
         return np.array(observations)
-
-    def step_async(self, actions: NDArray[np.int64]) -> None:
-        """Keep the actions, shape (B,), for :meth:`step_wait`."""
-        self._actions = actions
 
     def step_wait(
         self,

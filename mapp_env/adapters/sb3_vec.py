@@ -92,7 +92,6 @@ class MappSb3VecEnv(RowsVecEnv):
         self.engine = MappVectorEnv(num_envs, autoreset_mode="SameStep", **arguments)
         self._seed: int | None = None
         self._wishes: dict[str, Any] = {}
-        self._actions: Any = None
         self._masks: NDArray[np.int8] | None = None  # (B, N, A), once there are episodes
         self._returns = np.zeros(self.engine.num_envs)
         self._lengths = np.zeros(self.engine.num_envs, np.int64)
@@ -181,10 +180,6 @@ class MappSb3VecEnv(RowsVecEnv):
         self._returns[:] = 0.0
         self._lengths[:] = 0
         return observations
-
-    def step_async(self, actions: NDArray[np.int64]) -> None:
-        """Keep the actions, shape (B, N) or (B,), for :meth:`step_wait`."""
-        self._actions = actions
 
     def step_wait(
         self,

@@ -6,24 +6,21 @@ import os
 from collections.abc import Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium import logger, spaces
-from gymnasium.error import ResetNeeded
+from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mapp_env.display import Display
 from mapp_env.grid import Grid
-from mapp_env.simulation import Simulation
-from mapp_env.task import RENDER_MODES, Task, find_grid
-from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
+from mapp_env.gymnasium_env import SimulationEnv
+from mapp_env.task import Task, find_grid
+from mapp_env.validation import as_integer, describe
 
 __all__ = ["TupleEnv"]
 
 Views = tuple[NDArray[np.float32], ...]
 
 
-class TupleEnv(gymnasium.Env[Views, Any]):
+class TupleEnv(SimulationEnv):
     """The problem for independent or factored learners, registered as ``mapp_env/Tuple-v0``.
 
     Observations and actions are tuples with an entry an agent, rewards a list with the team reward
@@ -49,8 +46,6 @@ class TupleEnv(gymnasium.Env[Views, Any]):
         If an argument is not as said.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 5}  # noqa: RUF012
-
     def __init__(
         self,
         grid: str | os.PathLike[str] | Grid = "paper-7x7",
@@ -72,18 +67,14 @@ class TupleEnv(gymnasium.Env[Views, Any]):
             allow_wait,
             render_mode,
         )
-        self.task = task
+        super().__init__(task, task.n_agents)
         self.n_agents = task.n_agents
-        self.render_mode = task.render_mode
         seen = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
         self.observation_space = spaces.Tuple([seen] * task.n_agents)
         self.action_space = spaces.Tuple(
             [spaces.Discrete(task.n_actions) for _ in range(task.n_agents)]
         )
         self.action_masks = np.zeros((task.n_agents, task.n_actions), np.int8)
-        self._simulation = Simulation(task, task.n_agents)
-        self._started = False
-        self._display = Display(task.render_mode, self.metadata["render_fps"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -95,15 +86,7 @@ class TupleEnv(gymnasium.Env[Views, Any]):
         ValueError
             If seed or options cannot be used.
         """
-        if seed is not None:
-            seed = check_count("seed", seed, 0, MAX_SEED)
-        problem = self.task.check_options(options)
-        super().reset(seed=seed)
-        self._simulation.reset(problem, self.np_random)
-        self._started = True
-        if self.render_mode == "human":
-            self.render()
-        views, self.action_masks = self._simulation.observe()
+        views, self.action_masks = self._start(seed, options)
         return tuple(views), {}
 
     def step(self, action: Sequence[int]) -> tuple[Views, list[float], bool, bool, dict[str, Any]]:  # type: ignore[override]
@@ -126,17 +109,11 @@ class TupleEnv(gymnasium.Env[Views, Any]):
         gymnasium.error.ResetNeeded
             If there is no episode to step.
         """
-        if not self._simulation.running:
-            raise ResetNeeded("step() needs an episode in progress: call reset() first")
-        actions = self._read_actions(action)
-        reward, terminated, truncated, views, masks = self._simulation.step(actions)
-        self.action_masks = masks
+        reward, terminated, truncated, views, self.action_masks = self._play(action)
         info = {"success": float(terminated)} if terminated or truncated else {}
-        if self.render_mode == "human":
-            self.render()
         return tuple(views), [reward] * self.n_agents, terminated, truncated, info
 
-    def _read_actions(self, action: Any) -> NDArray[np.int64]:
+    def _read_action(self, action: Any) -> NDArray[np.int64]:
         """Return each agent's action, shape (N,)."""
         highest = self.task.n_actions - 1
         numbers = [as_integer(one) for one in action] if isinstance(action, Sequence) else []
@@ -161,21 +138,3 @@ class TupleEnv(gymnasium.Env[Views, Any]):
         The costs are inf as long as a landmark is unvisited.
         """
         return self._simulation.metrics()
-
-    def render(self) -> Any:
-        """Show the episode as ``render_mode`` says; see the PettingZoo face.
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
-        """
-        if not self._started:
-            raise ResetNeeded("render() needs an episode: call reset() first")
-        if self.render_mode is None:
-            logger.warn("render() shows nothing: make the environment with a render_mode")
-        return self._display.show(self._simulation.scene())
-
-    def close(self) -> None:
-        """Close the window, if there is one; may be called again."""
-        self._display.close()

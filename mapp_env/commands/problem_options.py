@@ -9,7 +9,6 @@ import re
 from mapp_env.grid import Grid
 from mapp_env.grids import generator_names, grid_names, make_grid
 from mapp_env.problem import Problem, sample_problems
-from mapp_env.task import find_grid
 from mapp_env.validation import check_count, describe
 
 __all__ = [
@@ -169,7 +168,7 @@ def grid_of(arguments: argparse.Namespace) -> Grid:
             f"file, and there is no file {describe(name)}"
         )
     if name in grid_names():
-        return find_grid(name)
+        return make_grid(name)
     try:
         return Grid.load(name, depot)
     except ValueError as error:

@@ -1,0 +1,232 @@
+"""The loops that run the rules over rows, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.compiled import kernel
+from mapp_env.dynamics import measure_row, reset_row, step_row
+from mapp_env.grid import fill_distances
+from mapp_env.observation import observe_row
+from mapp_env.problem import draw_landmarks
+
+__all__ = [
+    "fill_fields",
+    "find_bad_action",
+    "measure_rows",
+    "observe_rows",
+    "reset_rows",
+    "step_and_observe",
+    "step_rows",
+]
+
+
+@kernel
+def step_and_observe(
+    row: NDArray[np.int32],
+    actions: NDArray[np.int64],
+    max_cycles: int,
+    n_agents: int,
+    n_landmarks: int,
+    reward: int,
+    kind: int,
+    table: NDArray[np.int32],
+    distances: NDArray[np.int32],
+    first_field: int,
+    view_distances: NDArray[np.int32],
+    first_view_field: int,
+    views: NDArray[np.float32],
+    masks: NDArray[np.int8],
+) -> tuple[float, bool, bool]:
+    """Step a row and look at it; parameters as in ``step_row`` and ``observe_row``."""
+    result: tuple[float, bool, bool] = step_row(
+        row,
+        actions,
+        n_agents,
+        n_landmarks,
+        max_cycles,
+        reward,
+        table,
+        distances,
+        first_field,
+    )
+    observe_row(
+        row,
+        n_agents,
+        n_landmarks,
+        kind,
+        table,
+        view_distances,
+        first_view_field,
+        views,
+        masks,
+    )
+    return result
+
+
+@kernel
+def step_rows(
+    rows: NDArray[np.int32],
+    actions: NDArray[np.int64],
+    skip: NDArray[np.bool_],
+    limits: NDArray[np.int64],
+    n_agents: int,
+    n_landmarks: int,
+    reward: int,
+    kind: int,
+    table: NDArray[np.int32],
+    distances: NDArray[np.int32],
+    first_field: int,
+    view_distances: NDArray[np.int32],
+    first_view_field: int,
+    rewards: NDArray[np.float64],
+    terminations: NDArray[np.bool_],
+    truncations: NDArray[np.bool_],
+    views: NDArray[np.float32],
+    masks: NDArray[np.int8],
+) -> None:
+    """Step all rows but those of ``skip``, and look at all; parameters as ``step_and_observe``."""
+    for index in range(rows.shape[0]):
+        field = _field_of(index, first_field, n_landmarks)
+        view_field = _field_of(index, first_view_field, n_landmarks)
+        if skip[index]:
+            rewards[index] = 0.0
+            terminations[index] = False
+            truncations[index] = False
+            observe_row(
+                rows[index],
+                n_agents,
+                n_landmarks,
+                kind,
+                table,
+                view_distances,
+                view_field,
+                views[index],
+                masks[index],
+            )
+        else:
+            rewards[index], terminations[index], truncations[index] = step_and_observe(
+                rows[index],
+                actions[index],
+                limits[index],
+                n_agents,
+                n_landmarks,
+                reward,
+                kind,
+                table,
+                distances,
+                field,
+                view_distances,
+                view_field,
+                views[index],
+                masks[index],
+            )
+
+
+@kernel
+def observe_rows(
+    rows: NDArray[np.int32],
+    indices: NDArray[np.int64],
+    n_agents: int,
+    n_landmarks: int,
+    kind: int,
+    table: NDArray[np.int32],
+    distances: NDArray[np.int32],
+    first_field: int,
+    views: NDArray[np.float32],
+    masks: NDArray[np.int8],
+) -> None:
+    """Look at some rows: ``views`` (M, V, F) and ``masks`` (M, N, A) of ``indices`` (M,)."""
+    for place, index in enumerate(indices):
+        field = _field_of(index, first_field, n_landmarks)
+        observe_row(
+            rows[index],
+            n_agents,
+            n_landmarks,
+            kind,
+            table,
+            distances,
+            field,
+            views[place],
+            masks[place],
+        )
+
+
+@kernel
+def _field_of(index: int, first_field: int, n_landmarks: int) -> int:
+    """Return what a row takes for ``first_field``: a line of its own if there are fields."""
+    return first_field if first_field < 0 else index * n_landmarks
+
+
+@kernel
+def reset_rows(
+    rows: NDArray[np.int32],
+    indices: NDArray[np.int64],
+    words: NDArray[np.uint64],
+    landmarks: NDArray[np.int32],
+    candidates: NDArray[np.int32],
+    depot: int,
+    n_agents: int,
+    n_landmarks: int,
+) -> None:
+    """Reset rows on given landmarks, or, where there are words, on landmarks drawn with them."""
+    for place, index in enumerate(indices):
+        if words.shape[0] > 0:
+            draw_landmarks(words[place], candidates, landmarks[place])
+        reset_row(rows[index], landmarks[place], depot, n_agents, n_landmarks)
+
+
+@kernel
+def measure_rows(
+    rows: NDArray[np.int32],
+    indices: NDArray[np.int64],
+    n_agents: int,
+    n_landmarks: int,
+    table: NDArray[np.int32],
+    costs: NDArray[np.float64],
+) -> None:
+    """Write the costs of some rows, (M, 3): cover time, makespan, total distance (R8)."""
+    for place, index in enumerate(indices):
+        cover_time, makespan, distance = measure_row(rows[index], n_agents, n_landmarks, table)
+        costs[place, 0] = cover_time
+        costs[place, 1] = makespan
+        costs[place, 2] = distance
+
+
+@kernel
+def fill_fields(
+    rows: NDArray[np.int32],
+    indices: NDArray[np.int64],
+    table: NDArray[np.int32],
+    n_agents: int,
+    n_landmarks: int,
+    fields: NDArray[np.int32],
+    queue: NDArray[np.int32],
+) -> None:
+    """Write the steps from every landmark of some rows: how grids too large for all pairs do it.
+
+    Shapes: ``rows`` (B, row_length), ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,).
+    """
+    for index in indices:
+        for landmark in range(n_landmarks):
+            start = rows[index, n_agents + landmark]
+            fill_distances(table, start, fields[index * n_landmarks + landmark], queue)
+
+
+@kernel
+def find_bad_action(actions: NDArray[np.uint64], n_actions: int) -> int:
+    """Return the position of the first action outside ``0..n_actions - 1``, or -1.
+
+    Shape: ``actions`` (M,), int64 seen as uint64, so that a negative action is a huge one.
+    """
+    limit = np.uint64(n_actions)
+    highest = np.uint64(0)
+    for action in actions:
+        # No early exit: the loop without one is vectorised, and bad actions are rare.
+        highest = max(highest, action)
+    if highest >= limit:
+        for position, action in enumerate(actions):
+            if action >= limit:
+                return position
+    return -1
