@@ -7,9 +7,11 @@ required, none may be added. Numbers are finite, no key comes twice, ``true`` is
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterable, Mapping
@@ -26,6 +28,7 @@ __all__ = [
     "labelled",
     "read_bytes",
     "read_record",
+    "remove_unfinished",
     "write_bytes",
     "write_record",
     "write_text",
@@ -40,6 +43,9 @@ MAX_PLAN_BYTES = 16 << 20
 """Largest plan file: sixteen tours of a hundred thousand cells."""
 
 MAX_INTEGER = 2**53 - 1  # what every reader of JSON keeps exactly
+MAX_LINKS = 40  # as Linux follows at most
+STREAMS = ("/proc/", "/dev/fd/")  # where a process finds the files it has open
+UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.tmp")  # until it is whole and takes its name
 
 
 class FileError(ValueError):
@@ -302,10 +308,13 @@ def write_text(path: str | os.PathLike[str], text: str, limit: int) -> None:
 def write_bytes(path: str | os.PathLike[str], data: bytes, limit: int) -> None:
     """Write a file whole or not at all: beside it first, then in its place.
 
+    A file that was there keeps its mode; of a link, what it leads to is replaced; another name of
+    the same file (a hard link) keeps the old content.
+
     Parameters
     ----------
     path : str or os.PathLike
-        The file; if it is there it must be a regular one, and is replaced.
+        The file; if it is there it must be a regular one that its owner may write.
     data : bytes
         Its content.
     limit : int
@@ -333,21 +342,49 @@ def check_writable(path: str | os.PathLike[str]) -> str:
     Raises
     ------
     FileError
-        If it is no path, its folder is not there, or something else than a file is there already.
+        If it is no path, its folder is not there, or there is something already that is no file or
+        may not be written.
     """
     if not isinstance(path, str | os.PathLike):
         raise FileError(f"path must be a str or os.PathLike, got {describe(path)}")
     try:
-        # A link stays a link: what it leads to is replaced.
-        target = os.path.realpath(path)
-        if os.path.exists(target) and not os.path.isfile(target):
-            raise FileError(f"{describe(path)}: is there and not a regular file")
+        target = _follow(os.fsdecode(path))
         os.stat(os.path.dirname(target))
+        status = os.stat(target) if os.path.lexists(target) else None
     except (OSError, ValueError) as error:
-        if isinstance(error, FileError):
-            raise
         raise FileError(f"{describe(path)}: cannot be written: {error}") from error
-    return os.fspath(target)
+    if target.startswith(STREAMS) or (status is not None and not stat.S_ISREG(status.st_mode)):
+        raise FileError(f"{describe(path)}: is there and not a regular file")
+    # To replace a file takes no right to write it; and to root no file is read-only.
+    if status is not None and not (status.st_mode & stat.S_IWUSR and os.access(target, os.W_OK)):
+        mode = f"{stat.S_IMODE(status.st_mode):04o}"
+        raise FileError(f"{describe(path)}: is there and may not be written: its mode is {mode}")
+    return target
+
+
+def _follow(path: str) -> str:
+    """Return what a path leads to through links, but for the streams of a process.
+
+    ``/dev/stdout`` may lead to a log: to write it is to append to it, not to replace it.
+    """
+    for _ in range(MAX_LINKS):
+        folder, name = os.path.split(path)
+        path = os.path.join(os.path.realpath(folder), name)
+        if path.startswith(STREAMS) or not os.path.islink(path):
+            return os.path.normpath(path)
+        path = os.path.join(os.path.dirname(path), os.readlink(path))
+    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+
+
+def remove_unfinished(folder: str | os.PathLike[str]) -> None:
+    """Remove what writers that were killed have left beside their files.
+
+    Only for a folder that nobody else writes into.
+    """
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if UNFINISHED.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                os.unlink(entry)
 
 
 def _replace(target: str, data: bytes) -> None:
@@ -355,9 +392,13 @@ def _replace(target: str, data: bytes) -> None:
     folder = os.path.dirname(target)
     beside = os.path.join(folder, f".{secrets.token_hex(8)}.tmp")
     try:
-        # The user's file mode mask applies, as to any new file.
-        handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        earlier = os.stat(target) if os.path.exists(target) else None
+        # The user's file mode mask applies to a new file; an old one may be nobody else's to read.
+        mode = 0o666 if earlier is None else 0o600
+        handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         with os.fdopen(handle, "wb") as file:
+            if earlier is not None:
+                _take_after(file.fileno(), earlier)
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -366,9 +407,23 @@ def _replace(target: str, data: bytes) -> None:
         with contextlib.suppress(OSError):
             os.unlink(beside)
         raise
+    # The new name is on the disk only when the folder is. But the file is there by now: a folder
+    # that cannot be opened (a drop box) or forced to the disk (a share) is no failure.
     if os.name == "posix":
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        with contextlib.suppress(OSError):
+            handle = os.open(folder, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+
+
+def _take_after(handle: int, earlier: os.stat_result) -> None:
+    """Give a file owner, group and mode of an earlier one, as far as this user can."""
+    if os.name == "posix":
+        for owner in (earlier.st_uid, -1):  # if not whose it was, then the group
+            with contextlib.suppress(OSError):
+                os.chown(handle, owner, earlier.st_gid)
+                break
+        with contextlib.suppress(OSError):  # as on disks that have no modes
+            os.chmod(handle, stat.S_IMODE(earlier.st_mode))

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
+import stat
+import tempfile
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +19,16 @@ import vrplib
 
 import mapp_env
 from mapp_env import FileError, Grid, Plan, Problem, make_grid, replay, solve
-from mapp_env.files import MAX_PLAN_BYTES, MAX_PROBLEM_BYTES, write_text
+from mapp_env.commands import main
+from mapp_env.files import (
+    MAX_PLAN_BYTES,
+    MAX_PROBLEM_BYTES,
+    check_writable,
+    remove_unfinished,
+    write_bytes,
+    write_text,
+)
+from mapp_env.rendering import compare_plans, save_animation
 from mapp_env.solvers import save_vrplib
 from mapp_env.solvers.distances import landmark_distances
 
@@ -340,6 +353,230 @@ def test_only_regular_files_are_replaced(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="allowed are 3"):
         write_text(tmp_path / "text", "four", 3)
     assert not (tmp_path / "text").exists()
+
+
+def draw(path: Path) -> None:
+    """Draw a plan as a figure."""
+    compare_plans(PROBLEM, {"optimum": solve(PROBLEM)}, path)
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "problem.json": PROBLEM.save,
+    "plan.json": lambda path: solve(PROBLEM).save(path),
+    "problem.vrp": lambda path: save_vrplib(PROBLEM, path),
+    "routes.png": draw,
+    "episode.gif": lambda path: save_animation(path, PROBLEM, [[0, 1]]),
+}
+
+
+@contextlib.contextmanager
+def file_mode_mask(mask: int) -> Iterator[None]:
+    """Set the mask of new files' modes for a while."""
+    before = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+@contextlib.contextmanager
+def ordinary_user() -> Iterator[Path]:
+    """Give a folder to an ordinary user, and be one for a while: root may do everything."""
+    root = os.getuid() == 0
+    with tempfile.TemporaryDirectory() as folder:
+        if root:
+            os.chown(folder, 65534, 65534)
+            os.setresuid(65534, 65534, 0)
+        try:
+            yield Path(folder)
+        finally:
+            if root:
+                os.setresuid(0, 0, 0)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_keeps_its_mode(name: str, tmp_path: Path) -> None:
+    """A new file has the mode that the user's mask leaves, one that was there keeps its own."""
+    path = tmp_path / name
+    for mask in (0o077, 0o002):
+        with file_mode_mask(mask):
+            WRITERS[name](path)
+        assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~mask
+        path.unlink()
+    for mode in (0o600, 0o664, 0o200):
+        path.write_text("before")
+        path.chmod(mode)
+        with file_mode_mask(0o022):
+            WRITERS[name](path)
+        assert stat.S_IMODE(path.stat().st_mode) == mode
+        assert path.stat().st_size > 10
+        path.unlink()
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_what_may_not_be_written_is_refused(name: str, tmp_path: Path) -> None:
+    """A file that its owner may not write stays as it is, whoever asks."""
+    path = tmp_path / name
+    path.write_text("before")
+    path.chmod(0o444)
+    with pytest.raises(FileError, match=rf"{name}\W*: is there and may not be written: .* 0444"):
+        WRITERS[name](path)
+    assert path.read_text() == "before"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o444
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_others_may_not_read_is_never_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is the file that takes the place of one of mode 600, at any moment of its making."""
+    path = tmp_path / "problem.json"
+    path.write_text("before")
+    path.chmod(0o600)
+    modes = []
+
+    def look(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any, **options: Any) -> Any:
+            result = function(*arguments, **options)
+            modes.extend(stat.S_IMODE(item.stat().st_mode) for item in tmp_path.iterdir())
+            return result
+
+        return call
+
+    with file_mode_mask(0o000), monkeypatch.context() as patch:
+        for call in ("open", "chown", "chmod", "fsync", "replace"):
+            patch.setattr(os, call, look(getattr(os, call)))
+        PROBLEM.save(path)
+    assert len(modes) > 8
+    assert set(modes) == {0o600}
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
+def test_a_file_keeps_its_owner(tmp_path: Path) -> None:
+    """What root writes in the place of a user's file is still that user's."""
+    path = tmp_path / "problem.json"
+    path.write_text("before")
+    os.chown(path, 65534, 65533)
+    path.chmod(0o640)
+    PROBLEM.save(path)
+    status = path.stat()
+    assert (status.st_uid, status.st_gid, stat.S_IMODE(status.st_mode)) == (65534, 65533, 0o640)
+
+
+def test_a_folder_that_cannot_be_read_is_written_into() -> None:
+    """In a drop box, where one may put files and not look, a file is written and replaced."""
+    with ordinary_user() as folder:
+        drop = folder / "drop"
+        drop.mkdir()
+        drop.chmod(0o333)
+        for problem in (Problem(make_grid(), (0,)), PROBLEM):
+            problem.save(drop / "problem.json")
+            assert Problem.load(drop / "problem.json") == problem
+        drop.chmod(0o777)
+        assert [path.name for path in drop.iterdir()] == ["problem.json"]
+
+
+def test_a_folder_that_cannot_be_synced_is_written_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a folder cannot be forced to the disk, as on some shares, a file is written."""
+    fsync = os.fsync
+
+    def of_files(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(22, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    for _ in range(2):
+        PROBLEM.save(tmp_path / "problem.json")
+    assert Problem.load(tmp_path / "problem.json") == PROBLEM
+
+
+def test_a_file_and_its_name_are_forced_to_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The content before it takes its name, then the folder: no crash of a machine undoes it."""
+    path = tmp_path / "problem.json"
+    synced = []
+    fsync = os.fsync
+
+    def watch(handle: int) -> None:
+        size = os.fstat(handle).st_size
+        synced.append("folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else (size, path.exists()))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", watch)
+    PROBLEM.save(path)
+    assert synced == [(path.stat().st_size, False), "folder"]
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs Linux")
+def test_a_stream_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What /dev/stdout leads to, a log or a pipe, is refused by name and stays what it is."""
+    log = tmp_path / "log.txt"
+    log.write_text("years of work\n")
+    reader, writer = os.pipe()
+    with log.open("a") as stream, open(writer, "w") as pipe:
+        (tmp_path / "first").symlink_to(f"/dev/fd/{stream.fileno()}")
+        (tmp_path / "out").symlink_to("first")
+        paths = [f"/proc/self/fd/{handle.fileno()}" for handle in (stream, pipe)]
+        paths += [f"/dev/fd/{handle.fileno()}" for handle in (stream, pipe)]
+        for path in (*paths, str(tmp_path / "out"), "/dev/null"):
+            with pytest.raises(FileError, match=rf"{path}\W*: is there and not a regular file"):
+                PROBLEM.save(path)
+            with pytest.raises(FileError, match="not a regular file"):
+                check_writable(path)
+            if path != "/dev/null":
+                assert main(["solve", "--landmarks", "0", "--out", path]) == 2
+                assert "--out" in capsys.readouterr().err
+    os.close(reader)
+    assert log.read_text() == "years of work\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["first", "log.txt", "out"]
+
+
+def test_links_are_followed(tmp_path: Path) -> None:
+    """A chain of links leads to a file, or to where one comes to be; one in a circle is refused."""
+    (tmp_path / "far").mkdir()
+    (tmp_path / "there").symlink_to("far")
+    (tmp_path / "far" / "next").symlink_to("../there/problem.json")
+    (tmp_path / "link").symlink_to(tmp_path / "far" / "next")
+    for _ in range(2):
+        PROBLEM.save(tmp_path / "link")
+        assert not (tmp_path / "far" / "problem.json").is_symlink()
+        assert Problem.load(tmp_path / "far" / "problem.json") == PROBLEM
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "far" / "next").is_symlink()
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(FileError, match=r"cannot be written: .*symbolic links"):
+        PROBLEM.save(tmp_path / "a")
+    assert (tmp_path / "a").is_symlink()
+    os.link(tmp_path / "far" / "problem.json", tmp_path / "kept.json")
+    Problem(make_grid(), (0,)).save(tmp_path / "link")
+    assert Problem.load(tmp_path / "kept.json") == PROBLEM
+
+
+def test_only_what_writers_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a writer that was killed has left goes; whatever else there is stays."""
+    foreign = (".problem.tmp", ".0123456789abcdef.tmp.txt", "0123456789abcdef.tmp", ".lock")
+    for name in foreign:
+        (tmp_path / name).write_text("mine")
+    (tmp_path / ".fedcba9876543210.tmp").mkdir()
+    (tmp_path / ".0123456789abcdef.tmp").symlink_to("elsewhere")
+    before = sorted(tmp_path.iterdir())
+
+    def killed(*_: object) -> None:
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", killed)
+        patch.setattr(os, "unlink", killed)
+        with pytest.raises(SystemExit):
+            write_bytes(tmp_path / "problem.json", b"half", 10)
+    assert len(list(tmp_path.iterdir())) == len(before) + 1
+    remove_unfinished(tmp_path)
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_broken_plan_is_not_saved(tmp_path: Path) -> None:
