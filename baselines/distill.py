@@ -34,6 +34,7 @@ from baselines.imitation import (
     good_actions_loss,
     own_options,
     run_imitation,
+    start_of,
 )
 from baselines.networks import Network, NetworkSpec, build_network, split_joint, torch_generator
 from baselines.policy import load_policy
@@ -171,8 +172,7 @@ def main(args: Args) -> int:
         setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
     else:
         setting, _ = read_setting(args.resume)
-    # A resumed run has what it started from in its own folder, until it has something better.
-    policy = args.policy and (args.resume or args.policy)
+    policy = args.policy and start_of(args.resume, args.policy)
     start = load_policy(policy).network if policy else None
     grid = setting.grid
     return run_imitation(args, ALGORITHM, setting, lambda: Distilled(args, grid, start), [])

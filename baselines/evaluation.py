@@ -17,9 +17,9 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.checks import check_count
 from baselines.guidance import Acting
-from baselines.runs import write_atomically
 from baselines.settings import Setting
 from mapp_env import Problem, make_vec, sample_problems, solve
+from mapp_env.files import write_text
 from mapp_env.solvers import optimal_costs, solve_universe
 
 # Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
@@ -28,6 +28,7 @@ EVALUATION_SEED = 0
 BATCH = 4096  # problems played at a time
 N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
+MAX_TABLE_BYTES = 1 << 20
 MAX_BATCH_LANDMARKS = 12  # of optimal_costs()
 MAX_EXACT_LANDMARKS = 20  # of solve(method="exact")
 
@@ -317,5 +318,5 @@ def save_table(folder: Path, evaluations: dict[str, Evaluation]) -> None:
     writer.writerow(["policy", *next(iter(rows.values()))])
     for label, figures in rows.items():
         writer.writerow([label, *figures.values()])
-    write_atomically(folder / "evaluation.csv", text.getvalue().encode())
-    write_atomically(folder / "evaluation.md", (format_table(evaluations) + "\n").encode())
+    write_text(folder / "evaluation.csv", text.getvalue(), MAX_TABLE_BYTES)
+    write_text(folder / "evaluation.md", format_table(evaluations) + "\n", MAX_TABLE_BYTES)

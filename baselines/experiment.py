@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checkpoints import Checkpoints, go_on
+from baselines.checkpoints import Checkpoints, go_on, save
 from baselines.evaluation import (
     EVALUATION_SEED,
     N_ROUTES,
@@ -73,13 +73,8 @@ def train(
 ) -> None:
     """Train until all episodes are over, or a signal comes; then leave a checkpoint."""
     args, learner = training.args, training.learner
-
-    def save() -> None:
-        number = training.now.steps + learner.updates
-        state = {**training.state(), "metrics": run.position()}
-        checkpoints.save(number, learner.arrays(), state)
-        training.watch.lap("log and save")
-
+    if not checkpoints.numbers():
+        save(run, checkpoints, training)
     progress = tqdm(
         total=args.n_episodes,
         initial=training.now.episodes,
@@ -98,10 +93,11 @@ def train(
                 save_policy(run.path(WEIGHTS_FILE), learner.policy().network, args.half_precision)
             training.watch.lap("log and save")
         if time.monotonic() - saved >= args.checkpoint_seconds:
-            save()
+            save(run, checkpoints, training)
+            training.watch.lap("log and save")
             saved = time.monotonic()
     progress.close()
-    save()
+    save(run, checkpoints, training)
     save_policy(run.path(WEIGHTS_FILE), learner.policy().network, args.half_precision)
     training.watch.lap("log and save")
     run.write_json(
@@ -195,19 +191,19 @@ def run_experiment(
         # The folder's name is none of what a run is: it may be moved.
         identity = {**config, "options": {**asdict(args), "out": None, "resume": None}}
         checkpoints = Checkpoints(folder, identity)
-        if resumed is None:
-            run.write_config(config)
-        elif go_on(run, checkpoints, training.restore):
-            now = training.now
-            print(f"going on from episode {now.episodes + 1}, step {now.steps:,}")
-        if n_evaluated < args.evaluation_problems:
-            print(
-                f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there are "
-                "no more unseen ones"
-            )
-        # Without a terminal there is no bar: say where to look.
-        print(f"training, {args.n_episodes} episodes: {run.path(METRICS_FILE)}", flush=True)
         with signals:
+            if resumed is None:
+                run.write_config(config)
+            elif go_on(run, checkpoints, training):
+                now = training.now
+                print(f"going on from episode {now.episodes + 1}, step {now.steps:,}")
+            if n_evaluated < args.evaluation_problems:
+                print(
+                    f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there "
+                    "are no more unseen ones"
+                )
+            # Without a terminal there is no bar: say where to look.
+            print(f"training, {args.n_episodes} episodes: {run.path(METRICS_FILE)}", flush=True)
             train(training, run, checkpoints, signals)
         print(
             f"{training.now.episodes} episodes, {training.now.steps:,} steps and "

@@ -28,13 +28,14 @@ import tyro
 from baselines.evaluation import evaluate, every_problem
 from baselines.networks import NetworkSpec
 from baselines.policy import find_weights, load_policy
-from baselines.runs import write_atomically
 from baselines.settings import Setting
 from baselines.trained import load_trained
 from mapp_env import Grid, make_grid
+from mapp_env.files import write_bytes
 
 PLAYGROUND = Path(__file__).resolve().parents[1] / "docs" / "playground"
 COMMAND = "python baselines/export_playground.py"
+MAX_SCRIPT_BYTES = 64 << 20
 
 
 @dataclass
@@ -187,7 +188,7 @@ def main(args: Args) -> None:
         )
         return
     script = export(args.policy).encode()
-    write_atomically(args.out, script)
+    write_bytes(args.out, script, MAX_SCRIPT_BYTES)
     print(f"{args.out}: {len(script) / 1e6:.2f} MB")
 
 

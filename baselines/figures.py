@@ -26,7 +26,7 @@ from baselines.checks import check_count
 from baselines.evaluation import Evaluation
 from baselines.runs import METRICS_FILE, read_metrics
 from mapp_env import Problem, replay, solve
-from mapp_env.rendering import compare_plans
+from mapp_env.rendering import compare_plans, save_figure
 
 DPI = 120
 ROUTES_FILES = ("fig4a_routes.png", "fig4b_routes.png")
@@ -58,7 +58,7 @@ def draw_learning_curves(folder: Path, window: int = 30) -> list[Path]:
     )
     paths = []
     for name, column, label, title in panels:
-        figure, axes = plt.subplots(figsize=(7.0, 3.6), layout="constrained")
+        figure, axes = plt.subplots(figsize=(7.0, 3.6), dpi=DPI, layout="constrained")
         _draw_curve(axes, metrics["episode"], metrics[column], metrics["problem"], window)
         axes.set(xlabel="Episode", ylabel=label)
         axes.set_title(title, loc="left", fontsize="medium")
@@ -143,6 +143,7 @@ def draw_comparison(
         len(presets),
         4,
         figsize=(14.0, 3.2 * len(presets)),
+        dpi=DPI,
         layout="constrained",
         squeeze=False,
         width_ratios=(3, 3, 2, 2),
@@ -191,7 +192,7 @@ def draw_comparison(
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    figure.savefig(path, dpi=DPI)
+    save_figure(figure, path)
     plt.close(figure)
     return path
 

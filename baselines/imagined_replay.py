@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit  # type: ignore[import-untyped]
 
+from baselines.checkpoints import take
 from baselines.networks import NetworkSpec, split_joint
 from baselines.replay_memory import Batch
 from mapp_env import Grid
@@ -217,9 +218,7 @@ class ImaginedReplay:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`arrays_by_name` returned."""
         for name, array in self.arrays_by_name().items():
-            if arrays[name].shape != array.shape or arrays[name].dtype != array.dtype:
-                raise ValueError(f"{name}: another shape or type than this replay has")
-            setattr(self, name, arrays[name].copy())
+            setattr(self, name, take(arrays, name, array))
 
 
 def join(cells: np.ndarray, landmarks: np.ndarray, visited: np.ndarray) -> np.ndarray:

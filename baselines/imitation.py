@@ -6,6 +6,7 @@ folder, checkpoints, and the table at the end. A pupil's network is trained as a
 outputs are read as logits, and the greedy policy takes the largest, as it does of values.
 """
 
+import signal
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -18,7 +19,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checkpoints import Checkpoints, go_on, part
+from baselines.checkpoints import Checkpoints, go_on, part, save
 from baselines.checks import check_count, check_flag, check_number
 from baselines.evaluation import (
     count_unseen,
@@ -159,11 +160,31 @@ class Pupil(ABC):
         """Take over what was saved."""
         weights = part(arrays, "network")
         self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
-        restore_optimiser(self.optimiser, part(arrays, "optimiser"))
-        self.restore_own(arrays)
         self.updates, self.seconds = state["updates"], state["seconds"]
+        restore_optimiser(self.optimiser, part(arrays, "optimiser"), self.updates)
+        self.restore_own(arrays)
         self.rng.bit_generator.state = state["rng"]
         self.losses = list(state["losses"])
+
+    @property
+    def number(self) -> int:
+        """Updates so far."""
+        return self.updates
+
+    def check_metrics(self, table: dict[str, list[float]]) -> None:
+        """Compare where it stands with the rows that are written.
+
+        Raises
+        ------
+        ValueError
+            If they differ.
+        """
+        rows, left = divmod(self.updates, LOGGED)
+        if (len(table["updates"]), len(self.losses)) != (rows, left):
+            raise ValueError(
+                f"after {self.updates} updates there must be {rows} rows in metrics.csv and {left} "
+                f"losses, got {len(table['updates'])} and {len(self.losses)}"
+            )
 
 
 # -- loss --------------------------------------------------------------------------------------
@@ -215,10 +236,17 @@ def own_options(args: Chosen, algorithm: str) -> Chosen:
         raise ValueError(f"{args.resume}: {error}") from error
 
 
+def start_of(resume: Path | None, policy: str | Path | None) -> str | Path | None:
+    """Return where the policy is that a training starts from.
+
+    Of a resumed run it is in its own folder, if the run was not killed before it was there.
+    """
+    own = resume is not None and (resume / WEIGHTS_FILE).is_file()
+    return resume if own else policy
+
+
 def starting_point(policy: str | Path | None) -> Trained:
     """Return the meta-agent that a training starts from.
-
-    Of a resumed run it is in its own folder, until it has something better.
 
     Raises
     ------
@@ -233,11 +261,8 @@ def starting_point(policy: str | Path | None) -> Trained:
 def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals) -> None:
     """Teach until all updates are done, or a signal comes; then leave a checkpoint."""
     args = pupil.args
-
-    def save() -> None:
-        state = {**pupil.state(), "metrics": run.position()}
-        checkpoints.save(pupil.updates, pupil.arrays(), state)
-
+    if not checkpoints.numbers():
+        save(run, checkpoints, pupil)
     bar = tqdm(total=args.updates, initial=pupil.updates, unit=" updates", disable=None)
     saved = time.monotonic()
     while pupil.updates < args.updates and signals.received is None:
@@ -247,10 +272,10 @@ def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopS
             run.log({"updates": pupil.updates, "loss": sum(pupil.losses) / LOGGED})
             pupil.losses.clear()
         if time.monotonic() - saved >= args.checkpoint_seconds:
-            save()
+            save(run, checkpoints, pupil)
             saved = time.monotonic()
     bar.close()
-    save()
+    save(run, checkpoints, pupil)
     save_policy(run.path(WEIGHTS_FILE), pupil.network, args.half_precision)
     run.write_json(
         TIMING_FILE, {"updates": pupil.updates, "seconds_total": round(pupil.seconds, 3)}
@@ -295,17 +320,17 @@ def run_imitation(
     signals = StopSignals()
     try:
         checkpoints = Checkpoints(folder, identity)
-        if args.resume is None:
-            # What it starts from, to the bit: it may have to start again.
-            save_policy(run.path(WEIGHTS_FILE), pupil.network)
-            run.write_config(identity)
-        elif go_on(run, checkpoints, pupil.restore):
-            print(f"going on from update {pupil.updates + 1:,}")
         with signals:
+            if args.resume is None:
+                run.write_config(identity)
+            elif go_on(run, checkpoints, pupil):
+                print(f"going on from update {pupil.updates + 1:,}")
+            if not checkpoints.numbers():
+                # What it starts from, to the bit: it may have to start again.
+                save_policy(run.path(WEIGHTS_FILE), pupil.network)
             train(pupil, run, checkpoints, signals)
         if signals.received is not None:
-            print(f"stopped early; go on with --resume {folder}", flush=True)
-            return 128 + signals.received
+            raise KeyboardInterrupt
         if n_evaluated:
             problems = unseen_problems(setting, n_evaluated, seen)
             policy = load_policy(folder)  # as it was kept, so perhaps rounded
@@ -313,6 +338,9 @@ def run_imitation(
             table = {"network alone": evaluate(policy, setting, problems, optima)}
             save_table(folder, table)
             print(format_table(table))
+    except KeyboardInterrupt:
+        print(f"stopped early; go on with --resume {folder}", flush=True)
+        return 128 + (signals.received or signal.SIGINT)
     except OSError as error:
         raise ValueError(f"{folder}: cannot be written: {error}") from error
     finally:

@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from baselines.checkpoints import take
 from baselines.checks import check_count
 from baselines.experiment import run_experiment
 from baselines.imagined_replay import ImaginedReplay
@@ -228,7 +229,7 @@ class MetaLearner(QLearner):
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
         """Take over what was saved."""
         super().restore(arrays, state)
-        self.here = torch.from_numpy(arrays["here"].copy())
+        self.here = torch.from_numpy(take(arrays, "here", self.here.numpy()))
 
     def chosen(self, values: Tensor, actions: Tensor) -> Tensor:
         """Return the values of the joint actions taken."""

@@ -16,8 +16,9 @@ import torch
 
 from baselines.checks import check_count, check_observations, check_rows
 from baselines.networks import Network, NetworkSpec, build_network, greedy_actions
-from baselines.runs import WEIGHTS_FILE, parse_json, read_bytes, write_atomically
+from baselines.runs import WEIGHTS_FILE, parse_json
 from mapp_env import Grid
+from mapp_env.files import read_bytes, write_bytes
 
 WEIGHTS_KEY = "mapp_env_policy"  # the one metadata entry of our safetensors files
 WEIGHTS_VERSION = 1
@@ -117,7 +118,7 @@ def save_policy(path: Path, network: Network, half_precision: bool = False) -> N
     if half_precision:
         most = torch.finfo(torch.float16).max
         tensors = {k: t.half() if t.abs().max() <= most else t for k, t in tensors.items()}
-    write_atomically(path, safetensors.torch.save(tensors, {WEIGHTS_KEY: about}))
+    write_bytes(path, safetensors.torch.save(tensors, {WEIGHTS_KEY: about}), MAX_WEIGHTS_BYTES)
 
 
 def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
@@ -141,7 +142,7 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
         from the file.
     """
     file = find_weights(path)
-    content = read_bytes(file, MAX_WEIGHTS_BYTES)
+    content = read_bytes(file, MAX_WEIGHTS_BYTES, "a weights file", ValueError)
     spec = read_spec(file, content)
     try:
         weights = safetensors.torch.load(content)

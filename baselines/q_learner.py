@@ -194,13 +194,13 @@ class QLearner(ABC):
         for name, network in (("network", self.network), ("target", self.target)):
             weights = part(arrays, name)
             network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
-        restore_optimiser(self.optimiser, part(arrays, "optimiser"))
+        self.updates = state["updates"]
+        restore_optimiser(self.optimiser, part(arrays, "optimiser"), self.updates)
         self.replay.restore(part(arrays, "replay"))
         prepared = part(arrays, "prepared")
-        if prepared:
+        if self.ahead and self.updates:
             targets = torch.from_numpy(prepared.pop("targets"))
             self.prepared = Batch(**prepared), targets
-        self.updates = state["updates"]
         self.rng.bit_generator.state = state["rng"]
 
 

@@ -12,6 +12,7 @@ over them. The price is that their moves were meant for the landmarks that were 
 
 import numpy as np
 
+from baselines.checkpoints import take
 from baselines.imagined_replay import RelabelledReward, is_on
 from baselines.networks import NetworkSpec
 from baselines.replay_memory import Batch, ReplayMemory
@@ -90,7 +91,7 @@ class RelabelledReplay:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`arrays_by_name` returned."""
         self.memory.restore(arrays)
-        self.known = arrays["known"].copy()
+        self.known = take(arrays, "known", self.known)
 
 
 def rewards_of(

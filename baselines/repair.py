@@ -34,6 +34,7 @@ from baselines.imitation import (
     Pupil,
     own_options,
     run_imitation,
+    start_of,
     starting_point,
 )
 from baselines.networks import Network
@@ -223,7 +224,8 @@ class Repaired(Pupil):
 def main(args: Args) -> int:
     """Mend and evaluate; return the exit code."""
     args = own_options(args, ALGORITHM)
-    policy, setting, seen = starting_point(args.policy if args.resume is None else args.resume)
+    start = start_of(args.resume, args.policy)
+    policy, setting, seen = starting_point(start)
     return run_imitation(
         args, ALGORITHM, setting, lambda: Repaired(args, setting, policy.network), seen
     )

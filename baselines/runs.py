@@ -12,7 +12,8 @@ evaluation.csv/.md  the table over unseen problems
 fig*.png            the paper's figures 2, 3 and 4
 =================== ==============================================================
 
-metrics.csv holds no wall time: two runs with one seed write the same bytes.
+metrics.csv holds no wall time: two runs with one seed write the same bytes. Files are written by
+``mapp_env.files``: whole or not at all.
 """
 
 import csv
@@ -23,7 +24,6 @@ import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -35,12 +35,27 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from mapp_env.files import (
+    UNFINISHED,
+    read_bytes,
+    remove_unfinished,
+    unique_fields,
+    write_bytes,
+)
+
+try:
+    import fcntl
+except ImportError:  # Windows, where nobody can delete a file that is open
+    fcntl = None  # type: ignore[assignment]
+
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.csv"
 WEIGHTS_FILE = "policy.safetensors"
 TIMING_FILE = "timing.json"
+CHECKPOINTS = "checkpoints"
 LOCK_FILE = ".lock"
 MAX_TEXT_BYTES = 64 * 1024 * 1024  # no file of ours comes near; refuse to read more
+MAX_HEADER_BYTES = 1024  # of metrics.csv
 
 VERSIONED = ("mapp_env", "numpy", "numba", "torch", "gymnasium", "pettingzoo", "safetensors")
 
@@ -51,7 +66,8 @@ class RunFolder:
     Parameters
     ----------
     folder
-        Where; it must not exist, or be empty, unless a run is resumed.
+        Where; it must not exist, or be empty, unless a run is resumed. (A training that was killed
+        before its config was written has left nothing.)
     columns
         The columns of metrics.csv.
     resume
@@ -71,7 +87,7 @@ class RunFolder:
             raise ValueError(f"resume must be a run folder, got {str(folder)!r}")
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            occupied = not resume and any(path.name != LOCK_FILE for path in folder.iterdir())
+            occupied = not resume and foreign_entry(folder) is not None
         except OSError as error:
             raise ValueError(f"out must be a folder that can be made: {error}") from error
         if occupied:
@@ -85,15 +101,41 @@ class RunFolder:
             raise ValueError(f"{folder}: another training is writing into it") from None
         except OSError as error:
             raise ValueError(f"{folder}: cannot be written into: {error}") from error
-        mode = "r+" if resume else "w+"
         try:
-            self._metrics = (folder / METRICS_FILE).open(mode, newline="", encoding="utf-8")
+            self._open(resume)
         except OSError as error:
             self._lock.release()
             raise ValueError(f"{folder}: cannot be written into: {error}") from error
+        except ValueError:
+            self._lock.release()
+            raise
+
+    def _open(self, resume: bool) -> None:
+        """Open metrics.csv, and clear away what a killed training was about to write."""
+        mode = "r+" if resume else "a+"
+        self._metrics = self.path(METRICS_FILE).open(mode, newline="", encoding="utf-8")
         self._writer = csv.writer(self._metrics, lineterminator="\n")
-        if not resume:
-            self._write_row(self.columns)
+        try:
+            self._hold()
+            for folder in (self.folder, self.path(CHECKPOINTS)):
+                if folder.is_dir():
+                    remove_unfinished(folder)
+            if not resume:
+                self.restart()
+        except BaseException:
+            self._metrics.close()
+            raise
+
+    def _hold(self) -> None:
+        """Lock metrics.csv as well: of a lock file that was deleted others have another one."""
+        if fcntl is None:
+            return
+        try:
+            fcntl.flock(self._metrics, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            raise ValueError(f"{self.folder}: another training is writing into it") from None
+        except OSError:  # a file system without such locks
+            pass
 
     def path(self, name: str) -> Path:
         """Where the file called `name` is in this run."""
@@ -106,7 +148,7 @@ class RunFolder:
     def write_json(self, name: str, content: object) -> None:
         """Write a JSON file in one piece."""
         text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-        write_atomically(self.path(name), text.encode())
+        write_bytes(self.path(name), text.encode(), MAX_TEXT_BYTES)
 
     def log(self, row: Mapping[str, object]) -> None:
         """Append one row to metrics.csv and hand it to the operating system at once."""
@@ -117,27 +159,43 @@ class RunFolder:
         self._metrics.flush()
 
     def position(self) -> dict[str, Any]:
-        """Force metrics.csv to the disk; return what is in it, for a checkpoint."""
-        os.fsync(self._metrics.fileno())
-        content = read_bytes(self.path(METRICS_FILE), MAX_TEXT_BYTES)
-        return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-
-    def rewind(self, position: Mapping[str, Any]) -> None:
-        """Cut metrics.csv back to where a checkpoint was written; what came later comes again.
+        """Force metrics.csv to the disk; return what is in it, for a checkpoint.
 
         Raises
         ------
         ValueError
-            If what was written before that has changed.
+            If there is another file in its place.
+        OSError
+            If there is none.
         """
-        content = read_bytes(self.path(METRICS_FILE), MAX_TEXT_BYTES)[: position["bytes"]]
+        path = self.path(METRICS_FILE)
+        os.fsync(self._metrics.fileno())
+        if not os.path.samestat(os.fstat(self._metrics.fileno()), path.stat()):
+            raise ValueError(f"{path}: is no longer the file that this training writes")
+        content = read_metrics_file(self.folder)
+        return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+
+    def rows_at(self, position: Mapping[str, Any]) -> dict[str, list[float]]:
+        """Return what was in metrics.csv when a checkpoint was written, by columns.
+
+        Raises
+        ------
+        ValueError
+            If it has changed since.
+        """
+        path = self.path(METRICS_FILE)
+        content = read_metrics_file(self.folder)[: position["bytes"]]
         if hashlib.sha256(content).hexdigest() != position["sha256"]:
-            raise ValueError(f"{self.path(METRICS_FILE)}: changed since the checkpoint was written")
+            raise ValueError(f"{path}: changed since the checkpoint was written")
+        return parse_metrics(path, content)
+
+    def rewind(self, position: Mapping[str, Any]) -> None:
+        """Cut metrics.csv back to where a checkpoint was written; what came later comes again."""
         self._metrics.truncate(position["bytes"])
         self._metrics.seek(position["bytes"])
 
     def restart(self) -> None:
-        """Cut metrics.csv back to its header: no checkpoint had been written."""
+        """Cut metrics.csv back to its header."""
         self._metrics.seek(0)
         self._metrics.truncate(0)
         self._write_row(self.columns)
@@ -146,6 +204,22 @@ class RunFolder:
         """Close metrics.csv and release the folder."""
         self._metrics.close()
         self._lock.release()
+
+
+def foreign_entry(folder: Path) -> str | None:
+    """Return the name of something in a folder that was there before any training, None if all is.
+
+    A training that is killed before its config is written leaves its lock, the file that was to be
+    the config, and a metrics.csv without rows.
+    """
+    for path in sorted(folder.iterdir()):
+        if path.name == METRICS_FILE and path.is_file() and path.stat().st_size < MAX_HEADER_BYTES:
+            if b"\n" not in path.read_bytes()[:-1]:
+                continue
+        elif path.name == LOCK_FILE or UNFINISHED.fullmatch(path.name):
+            continue
+        return path.name
+    return None
 
 
 def default_folder(algorithm: str, preset: str, seed: int) -> Path:
@@ -159,11 +233,11 @@ def read_config(folder: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If the file is missing, too large, or not a JSON object.
+        If the file is missing, too large, not a JSON object, or has an entry twice.
     """
     path = folder / CONFIG_FILE
     try:
-        config = json.loads(read_bytes(path, MAX_TEXT_BYTES))
+        config = parse_json(read_bytes(path, MAX_TEXT_BYTES, "a config file", ValueError))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a readable config: {error}") from error
     if not isinstance(config, dict):
@@ -179,8 +253,23 @@ def read_metrics(folder: Path) -> dict[str, list[float]]:
     ValueError
         If the file is missing, too large, or not a table of numbers.
     """
-    path = folder / METRICS_FILE
-    text = read_bytes(path, MAX_TEXT_BYTES).decode("utf-8", errors="replace")
+    return parse_metrics(folder / METRICS_FILE, read_metrics_file(folder))
+
+
+def read_metrics_file(folder: Path) -> bytes:
+    """Read a run's metrics.csv as it is.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing or too large.
+    """
+    return read_bytes(folder / METRICS_FILE, MAX_TEXT_BYTES, "a metrics file", ValueError)
+
+
+def parse_metrics(path: Path, content: bytes) -> dict[str, list[float]]:
+    """Return the columns of a metrics.csv; as :func:`read_metrics`."""
+    text = content.decode("utf-8", errors="replace")
     lines = text[: text.rfind("\n") + 1].splitlines()
     if not lines:
         raise ValueError(f"{path}: no header line")
@@ -202,28 +291,8 @@ def read_metrics(folder: Path) -> dict[str, list[float]]:
     return table
 
 
-def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """Read a regular file of at most `max_bytes`.
-
-    Raises
-    ------
-    ValueError
-        If there is no such file, it is not a regular one, or it is larger.
-    """
-    try:
-        if not path.is_file():  # also keeps us from waiting on a pipe
-            raise ValueError(f"{path}: not a regular file")
-        with path.open("rb") as file:
-            content = file.read(max_bytes + 1)
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from error
-    if len(content) > max_bytes:
-        raise ValueError(f"{path}: larger than {max_bytes} bytes")
-    return content
-
-
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON, but refuse an entry that is there twice: two readers could differ on it.
+    """Parse JSON, but refuse an entry that is there twice.
 
     Raises
     ------
@@ -232,38 +301,7 @@ def parse_json(text: str | bytes) -> Any:
     RecursionError
         If it is nested too deeply.
     """
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        entries = dict(pairs)
-        if len(entries) != len(pairs):
-            raise ValueError("an entry is there twice")
-        return entries
-
-    return json.loads(text, object_pairs_hook=unique)
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that, whatever happens, it is the old one or the new one, never a part.
-
-    The content goes to a temporary file beside it, to the disk, and then takes the name.
-    """
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp hides it from the group; results are for sharing
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-    if os.name == "posix":  # the new name is on the disk only when the folder is
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+    return json.loads(text, object_pairs_hook=unique_fields)
 
 
 def describe_environment() -> dict[str, Any]:

@@ -39,6 +39,7 @@ from baselines.imitation import (
     good_actions_loss,
     own_options,
     run_imitation,
+    start_of,
     starting_point,
 )
 from baselines.networks import Network, NetworkSpec, split_joint
@@ -280,8 +281,9 @@ def sharpen(network: Network, factor: float) -> None:
 def main(args: Args) -> int:
     """Improve and evaluate; return the exit code."""
     args = own_options(args, ALGORITHM)
-    policy, setting, seen = starting_point(args.policy if args.resume is None else args.resume)
-    if args.resume is None:
+    start = start_of(args.resume, args.policy)
+    policy, setting, seen = starting_point(start)
+    if start != args.resume:  # its own copy is sharp already
         sharpen(policy.network, args.sharpness)
     return run_imitation(
         args, ALGORITHM, setting, lambda: SelfImproved(args, setting, policy.network), seen

@@ -24,13 +24,12 @@ from baselines.runs import (
     TIMING_FILE,
     StopSignals,
     parse_json,
-    read_bytes,
     read_metrics,
-    write_atomically,
 )
 from baselines.trials import EVALUATION_FILE, Trial
+from mapp_env.files import read_bytes, write_text
 
-MAX_EVALUATION_BYTES = 1024 * 1024
+MAX_TABLE_BYTES = 1 << 20
 ROW = "network alone"
 RETURN_EPISODES = 100  # the last ones of a training, for its return
 N_RESAMPLES = 10_000
@@ -145,13 +144,15 @@ def read_outcome(trial: Trial) -> Outcome:
         If a file of it cannot be read.
     """
     path = trial.folder / EVALUATION_FILE
-    text = read_bytes(path, MAX_EVALUATION_BYTES).decode("utf-8", errors="replace")
+    content = read_bytes(path, MAX_TABLE_BYTES, "a table", ValueError)
+    text = content.decode("utf-8", errors="replace")
     rows = {row.get("policy"): row for row in csv.DictReader(io.StringIO(text))}
     metrics = read_metrics(trial.folder)
     limit = trial.options.max_cycles
     try:
         row = rows[ROW]
-        timing = parse_json(read_bytes(trial.folder / TIMING_FILE, MAX_EVALUATION_BYTES))
+        timing_file = trial.folder / TIMING_FILE
+        timing = parse_json(read_bytes(timing_file, MAX_TABLE_BYTES, "a timing file", ValueError))
         returns, solved = np.array(metrics["reward"]), np.array(metrics["solved"])
         measures = {
             "solved %": float(row["solved %"]),
@@ -266,8 +267,8 @@ def save_study(path: Path, columns: Sequence[str], summaries: Sequence[Summary])
         figures = [value for found in summary.measures.values() for value in found]
         writer.writerow([*summary.group, len(summary.outcomes), *figures])
     table = format_study(columns, summaries) + "\n"
-    write_atomically(path.with_suffix(".csv"), text.getvalue().encode())
-    write_atomically(path.with_suffix(".md"), table.encode())
+    write_text(path.with_suffix(".csv"), text.getvalue(), MAX_TABLE_BYTES)
+    write_text(path.with_suffix(".md"), table, MAX_TABLE_BYTES)
 
 
 def run_study(

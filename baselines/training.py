@@ -225,22 +225,60 @@ class Training:
 
     # -- checkpoints
 
+    @property
+    def number(self) -> int:
+        """Steps and updates so far."""
+        return self.now.steps + self.learner.updates
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        return self.learner.arrays()
+
     def state(self) -> dict[str, Any]:
-        """Return all that changes but for arrays, ready for JSON."""
+        """Return all else that changes, ready for JSON."""
         return {
             "progress": asdict(self.now),
+            "observation": self.observation.tolist(),
             "rng": self.rng.bit_generator.state,
             "learner": self.learner.state(),
             "seconds": self.watch.seconds,
         }
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what :meth:`state` and the learner's arrays were."""
-        self.now = Progress(**state["progress"])
+        """Take over what :meth:`arrays` and :meth:`state` returned.
+
+        What follows from the actions is not taken over: the episode so far is played again, as the
+        rules leave nothing to chance.
+
+        Raises
+        ------
+        ValueError
+            If something that must be there is not.
+        """
+        self.now = now = Progress(**state["progress"])
         self.rng.bit_generator.state = state["rng"]
         self.learner.restore(arrays, state["learner"])
         self.watch.seconds = dict(state["seconds"])
-        # The episode so far is played again: the rules leave nothing to chance.
         self.observation = self._reset()
-        for actions in self.now.actions:
-            self.observation = self._play(actions)[0]
+        now.reward, now.solved, now.over = 0.0, False, False
+        for actions in now.actions:
+            self.observation, reward, now.solved, truncated = self._play(actions)
+            now.reward += reward
+            now.over = now.solved or truncated
+
+    def check_metrics(self, table: dict[str, list[float]]) -> None:
+        """Compare where it stands with the rows of its finished episodes.
+
+        Raises
+        ------
+        ValueError
+            If they differ.
+        """
+        now = self.now
+        finished = now.episodes, now.steps - len(now.actions), self.learner.updates - now.updates
+        logged = len(table["episode"]), sum(table["steps"]), sum(table["updates"])
+        if finished != logged:
+            raise ValueError(
+                f"finished episodes, their steps and updates are {finished} by it, and {logged} by "
+                "metrics.csv"
+            )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from filelock import FileLock, Timeout
 
 from baselines.options import Options, parse_options
-from baselines.runs import CONFIG_FILE, LOCK_FILE, METRICS_FILE, read_config
+from baselines.runs import CONFIG_FILE, LOCK_FILE, foreign_entry, read_config
 
 EVALUATION_FILE = "evaluation.csv"  # a training writes it when it is through
 OWN_ENTRIES = ("out", "resume", "seed", "preset", "share_parameters", "threads", "prefetch")
@@ -102,7 +102,7 @@ def option_name(word: str) -> str:
 
 
 def check_folder(trial: Trial) -> None:
-    """Refuse what was trained with other options; clear away what did not come to begin.
+    """Refuse what was trained with other options, and what is no training.
 
     Raises
     ------
@@ -129,12 +129,8 @@ def check_folder(trial: Trial) -> None:
         return
     try:
         with FileLock(folder / LOCK_FILE, timeout=0):
-            for path in list(folder.iterdir()):
-                # Killed before its config was written.
-                own = path.name == METRICS_FILE or path.name.startswith(f".{CONFIG_FILE}.")
-                if own:
-                    path.unlink()
-                elif path.name != LOCK_FILE:
-                    raise ValueError(f"out: {folder} holds something else: {path.name}")
+            name = foreign_entry(folder)
+            if name is not None:
+                raise ValueError(f"out: {folder} holds something else: {name}")
     except Timeout:
         raise ValueError(f"out: another training is writing into {folder}") from None

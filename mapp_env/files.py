@@ -29,6 +29,7 @@ __all__ = [
     "read_bytes",
     "read_record",
     "remove_unfinished",
+    "unique_fields",
     "write_bytes",
     "write_record",
     "write_text",
@@ -182,7 +183,7 @@ def read_record(path: str | os.PathLike[str], kind: str, limit: int) -> Record:
     try:
         value = json.loads(
             data.decode("utf-8"),
-            object_pairs_hook=_unique,
+            object_pairs_hook=unique_fields,
             parse_constant=_refuse_constant,
             parse_float=_finite,
         )
@@ -257,7 +258,8 @@ def _shown(value: object) -> str:
     return describe(value)
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON, but refuse one with a key twice: two readers could differ on it."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         raise ValueError("an object has the same key twice")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import shutil
 import sys
@@ -135,3 +136,33 @@ def browser() -> Iterator[Any]:
 def training_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Keep the folders in which Stable-Baselines3 logs each training with the tests' own."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
+@pytest.fixture(scope="session")
+def forge() -> Callable[[Path, Path, Callable[[dict[str, Any], dict[str, Any]], object]], Path]:
+    """Return what copies a run with one checkpoint that is changed, with digests made to fit."""
+    import safetensors.numpy
+
+    def digest(content: bytes) -> str:
+        return hashlib.sha256(content).hexdigest()
+
+    def canonical(record: dict[str, Any]) -> bytes:
+        return (json.dumps(record, sort_keys=True) + "\n").encode()
+
+    def forged(
+        run: Path, copy: Path, change: Callable[[dict[str, Any], dict[str, Any]], object]
+    ) -> Path:
+        shutil.copytree(run, copy)
+        (path,) = (copy / "checkpoints").glob("*.json")
+        record = json.loads(path.read_text())
+        arrays = safetensors.numpy.load_file(path.with_suffix(".safetensors"))
+        change(arrays, record["state"])
+        content = safetensors.numpy.save({k: np.asarray(v, order="C") for k, v in arrays.items()})
+        record["arrays_sha256"] = digest(content)
+        del record["sha256"]
+        record["sha256"] = digest(canonical(record))
+        path.write_bytes(canonical(record))
+        path.with_suffix(".safetensors").write_bytes(content)
+        return copy
+
+    return forged

@@ -19,7 +19,7 @@ from baselines import evaluate, experiment, meta_dqn
 from baselines.figures import draw_learning_curves
 from baselines.options import preset_options
 from baselines.policy import load_policy
-from baselines.runs import RunFolder, read_config, read_metrics, write_atomically
+from baselines.runs import RunFolder, read_config, read_metrics
 from mapp_env import Grid
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -110,7 +110,10 @@ def test_run_leaves_all_it_promises(two_runs):
 
 
 def test_default_preset_leaves_all_it_promises(tmp_path, capsys):
-    """The default preset's run folder holds the same files, and no rows of guidance."""
+    """The default preset's run folder holds the same files, and no rows of guidance.
+
+    All of them have the mode that the user's mask leaves.
+    """
     args = meta_dqn.Args(
         n_problems=2,
         episodes_per_problem=3,
@@ -122,9 +125,15 @@ def test_default_preset_leaves_all_it_promises(tmp_path, capsys):
         evaluation_problems=20,
         out=tmp_path / "run",
     )
-    assert meta_dqn.main(args) == 0
+    before = os.umask(0o027)
+    try:
+        assert meta_dqn.main(args) == 0
+    finally:
+        os.umask(before)
     names = sorted(path.name for path in args.out.iterdir())
     assert names == sorted(PROMISED)
+    for path in (args.out, *args.out.rglob("*")):
+        assert path.stat().st_mode & 0o777 == (0o750 if path.is_dir() else 0o640), path
     columns = read_metrics(args.out)
     assert tuple(columns) == experiment.METRICS
     assert columns["guidance"] == [0.0] * 6
@@ -263,27 +272,56 @@ def test_torn_last_row_of_metrics_is_left_out(tmp_path):
     assert read_metrics(tmp_path) == {"episode": [1.0], "steps": [20.0]}
 
 
-@pytest.mark.parametrize("text", ["", "[1]", "{", "[" * 100_000])
+@pytest.mark.parametrize(
+    "text",
+    ["", "[1]", "{", "[" * 100_000, '{"a": 1, "a": 1}', '{"options": {"seed": 1, "seed": 2}}'],
+)
 def test_damaged_config_is_refused(tmp_path, text):
-    """A config that is no JSON object is refused with its path."""
+    """A config that is no JSON object, or says something twice, is refused with its path."""
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ValueError, match=r"config\.json: not a readable config"):
         read_config(tmp_path)
 
 
-def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
-    """If the disk gives out while writing, the old content stays and no scrap is left."""
-    path = tmp_path / "weights"
-    write_atomically(path, b"old")
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_failed_drawing_keeps_the_old_figures(two_runs, tmp_path, monkeypatch, call):
+    """If the disk gives out while figures are written, the old ones stay and no scrap is left."""
+    folder, _ = two_runs
+    (tmp_path / "metrics.csv").write_bytes((folder / "a" / "metrics.csv").read_bytes())
+    paths = draw_learning_curves(tmp_path)
+    before = [path.read_bytes() for path in paths]
+    assert before == [(folder / "a" / path.name).read_bytes() for path in paths]
 
-    def full_disk(handle: int) -> None:
+    def full_disk(*_: object) -> None:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OSError, match="no space"):
-        write_atomically(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert [item.name for item in tmp_path.iterdir()] == ["weights"]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, full_disk)
+        with pytest.raises(ValueError, match=r"fig2_reward\.png.*no space"):
+            draw_learning_curves(tmp_path, window=3)
+    assert [path.read_bytes() for path in paths] == before
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_training_that_never_came_to_be_is_in_nobodys_way(tmp_path):
+    """Killed before its config was written, its folder is as good as an empty one.
+
+    But a metrics.csv with rows, or any other file, is somebody's.
+    """
+    run = tmp_path / "run"
+    run.mkdir()
+    left = {".lock": "", "metrics.csv": "a,b\n", ".0123456789abcdef.tmp": '{"algorithm'}
+    for name, text in left.items():
+        (run / name).write_text(text)
+    RunFolder(run, ["a", "b"]).close()
+    assert sorted(path.name for path in run.iterdir()) == [".lock", "metrics.csv"]
+    assert (run / "metrics.csv").read_text() == "a,b\n"
+    for name, text in {"metrics.csv": "a,b\n1,2\n", "policy.safetensors": "w", "x": ""}.items():
+        (run / name).write_text(text)
+        with pytest.raises(ValueError, match="out must be a new or empty folder"):
+            RunFolder(run, ["a", "b"])
+        assert (run / name).read_text() == text
+        (run / name).unlink()
 
 
 SHORT = {

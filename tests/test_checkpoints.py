@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from baselines import checkpoints as module
 from baselines.checkpoints import CheckpointError, Checkpoints
+from mapp_env import files
 
 CONFIG = {"algorithm": "meta_dqn", "options": {"seed": 1}}
 
@@ -47,13 +47,34 @@ def test_what_was_saved_is_loaded(tmp_path):
 
 
 def test_the_last_two_are_kept(tmp_path):
-    """Older ones are deleted, and so is what a crash left behind."""
+    """Older ones are deleted, and so are the arrays of one that never came to be."""
     checkpoints = save(tmp_path, 1, 2)
-    (checkpoints.folder / ".000000000003.json.x").write_text("half")
+    (checkpoints.folder / f"{3:012d}.safetensors").write_text("half")
     checkpoints.save(10, *content(10))
     names = sorted(path.name for path in checkpoints.folder.iterdir())
     assert names == [f"{n:012d}.{kind}" for n in (2, 10) for kind in ("json", "safetensors")]
     assert checkpoints.numbers() == [2, 10]
+
+
+def test_what_was_just_saved_is_kept(tmp_path):
+    """However many newer ones there are that cannot be used, the last two that can be stay."""
+    checkpoints = save(tmp_path, 1)
+    for number in (50, 60):
+        (checkpoints.folder / f"{number:012d}.json").write_text("damaged")
+    for number in (2, 3, 4):
+        checkpoints.save(number, *content(number))
+        assert checkpoints.latest()[0].number == number
+    assert checkpoints.numbers() == [3, 4, 50, 60]
+
+
+def test_the_start_is_no_substitute(tmp_path):
+    """With the later ones damaged a run is not begun anew without a question."""
+    checkpoints = save(tmp_path, 0)
+    assert checkpoints.latest()[0].number == 0
+    checkpoints.save(7, *content(7))
+    (checkpoints.folder / f"{7:012d}.safetensors").write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match=r"no checkpoint can be used: .*000000000007"):
+        checkpoints.latest()
 
 
 def test_no_checkpoint_is_no_error(tmp_path):
@@ -89,7 +110,7 @@ def test_missing_parts_are_noticed(tmp_path):
     (checkpoints.folder / f"{2:012d}.safetensors").unlink()
     loaded, problems = checkpoints.latest()
     assert loaded.number == 1
-    assert "000000000002.safetensors: not a regular file" in problems[0].replace("\n", " ")
+    assert "000000000002.safetensors': cannot be opened as a checkpoint" in problems[0]
     (checkpoints.folder / f"{2:012d}.json").unlink()
     assert checkpoints.latest()[1] == []
     (checkpoints.folder / f"{1:012d}.safetensors").unlink()
@@ -136,16 +157,16 @@ def test_a_failed_save_leaves_the_old_ones(tmp_path, monkeypatch, writes):
     """If the disk is full at either part, the error is passed on and the old ones stand."""
     checkpoints = save(tmp_path, 1, 2)
     done = []
-    write = module.write_atomically
+    replace = files._replace
 
     def failing(path, data):
         if len(done) == writes:
             raise OSError(28, "No space left on device")
         done.append(path)
-        write(path, data)
+        replace(path, data)
 
-    monkeypatch.setattr(module, "write_atomically", failing)
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr(files, "_replace", failing)
+    with pytest.raises(ValueError, match=r"cannot be written: .*No space left"):
         checkpoints.save(3, *content(3))
     assert checkpoints.numbers() == [1, 2]
     assert checkpoints.latest()[0].number == 2

@@ -170,6 +170,46 @@ def test_stopped_and_resumed_is_the_same(tmp_path, monkeypatch):
         distill.main(distill.Args(resume=tmp_path / "run", seed=1))
 
 
+def test_what_is_wrong_with_a_checkpoint_is_said(tmp_path, monkeypatch, forge):
+    """Without any of its parts, or deleted, it is not continued, and metrics.csv stays.
+
+    Before that a second signal ends the training at once.
+    """
+    folder = tmp_path / "run"
+    lesson, calls = distill.Distilled.lesson, []
+
+    def interrupted(self):
+        calls.append(None)
+        for _ in range({130: 1, 131: 2}.get(len(calls), 0)):
+            os.kill(os.getpid(), signal.SIGTERM)
+        return lesson(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(distill.Distilled, "lesson", interrupted)
+        options = {**SMALL, "updates": 250, "checkpoint_seconds": 1e9}
+        assert distill.main(distill.Args(out=folder, **options)) == 143
+        assert distill.main(distill.Args(resume=folder)) == 143
+    assert len(calls) == 131
+    (folder / "checkpoints" / "000000000000.json").unlink()
+    arrays, state = {}, {}
+    forge(folder, tmp_path / "same", lambda a, s: (arrays.update(a), state.update(s)))
+    assert distill.main(distill.Args(resume=tmp_path / "same")) == 0
+    changes = [lambda a, s, name=name: a.pop(name) for name in arrays]
+    changes += [lambda a, s, name=name: s.pop(name) for name in state]
+    changes += [lambda a, s: [a.pop(n) for n in arrays if n.startswith("optimiser.")]]
+    changes += [lambda a, s: s.update(updates=129), lambda a, s: s["losses"].pop()]
+    for index, change in enumerate(changes):
+        copy = forge(folder, tmp_path / str(index), change)
+        with pytest.raises(ValueError, match=r"^checkpoint 130 does not fit this run: "):
+            distill.main(distill.Args(resume=copy))
+        assert (copy / "metrics.csv").read_bytes() == (folder / "metrics.csv").read_bytes()
+    for path in (folder / "checkpoints").iterdir():
+        path.unlink()
+    with pytest.raises(ValueError, match=r"checkpoints to go on from are gone"):
+        distill.main(distill.Args(resume=folder))
+    assert len((folder / "metrics.csv").read_text().splitlines()) == 2
+
+
 def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
     """With its weights, to the bit, even if it is gone later; another network is refused."""
     first, options = tmp_path / "first", {**SMALL, "updates": 10}

@@ -265,22 +265,28 @@ def test_sharpness_changes_no_greedy_action():
 
 
 def test_a_run_needs_nothing_but_its_folder(folder, tmp_path, monkeypatch):
-    """Killed before its first checkpoint, its start gone: it begins again from its own copy."""
+    """Killed before its first checkpoint, its start gone: it begins again from its own copy.
+
+    Killed before that copy was written, it begins again from the policy that it was given.
+    """
     options = {**SMALL, "updates": 20, "policy": str(folder), "sharpness": 3.0}
     assert self_improve.main(Args(out=tmp_path / "whole", **options)) == 0
 
     def killed(*arguments):
         raise ZeroDivisionError
 
-    with monkeypatch.context() as patch:
-        patch.setattr(imitation, "train", killed)
-        with pytest.raises(ZeroDivisionError):
-            self_improve.main(Args(out=tmp_path / "run", **options))
+    for name in ("save_policy", "train"):
+        with monkeypatch.context() as patch:
+            patch.setattr(imitation, name, killed)
+            with pytest.raises(ZeroDivisionError):
+                self_improve.main(Args(out=tmp_path / name, **options))
+    assert self_improve.main(Args(resume=tmp_path / "save_policy")) == 0
     for path in folder.iterdir():
         path.unlink()
-    assert self_improve.main(Args(resume=tmp_path / "run")) == 0
-    for name in ("metrics.csv", "policy.safetensors"):
-        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    (tmp_path / "run" / "checkpoints" / "000000000020.safetensors").write_bytes(b"damaged")
+    assert self_improve.main(Args(resume=tmp_path / "train")) == 0
+    for run in ("save_policy", "train"):
+        for name in ("metrics.csv", "policy.safetensors"):
+            assert (tmp_path / run / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    (tmp_path / "train" / "checkpoints" / "000000000020.safetensors").write_bytes(b"damaged")
     with pytest.raises(ValueError, match="checkpoint"):
-        self_improve.main(Args(resume=tmp_path / "run"))
+        self_improve.main(Args(resume=tmp_path / "train"))
