@@ -26,7 +26,9 @@ def restore_optimiser(
     """
     weights = [weight for group in optimiser.param_groups for weight in group["params"]]
     wanted = {}
-    for index, weight in enumerate(weights if steps else ()):
+    for index, weight in enumerate(weights):
+        if not steps or not weight.requires_grad:
+            continue
         shapes = {"step": (), "exp_avg": tuple(weight.shape), "exp_avg_sq": tuple(weight.shape)}
         wanted |= {f"{index}.{name}": shape for name, shape in shapes.items()}
     found = {name: array.shape for name, array in arrays.items()}

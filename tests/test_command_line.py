@@ -29,7 +29,6 @@ def command(arguments: list[str], folder: Path, code: str = "") -> subprocess.Co
         env=environ,
         capture_output=True,
         text=True,
-        timeout=120,
         check=False,
     )
 

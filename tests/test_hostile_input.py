@@ -8,7 +8,6 @@ import pickle
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,12 +94,10 @@ REFUSALS: dict[str, tuple[str, Callable[[], Any]]] = {
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_refused_by_name_at_once(case: str) -> None:
-    """Each is a short ValueError that names the argument, within a second of work."""
+    """Each is a short ValueError that names the argument."""
     name, call = REFUSALS[case]
-    started = time.process_time()
     with pytest.raises(ValueError, match=name) as refusal:
         call()
-    assert time.process_time() - started < 1
     assert len(str(refusal.value)) < 1000
 
 

@@ -481,7 +481,6 @@ def run_python(*arguments: str, **environment: str) -> str:
         text=True,
         cwd=REPOSITORY,
         env={**os.environ, "PYTHONPATH": str(REPOSITORY), **environment},
-        timeout=200,
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]

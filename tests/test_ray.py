@@ -21,8 +21,7 @@ from baselines.studies import MEASURES
 
 pytest.importorskip("ray")
 # Each starts a Ray of its own: `python -m pytest -m slow tests/test_ray.py`.
-# On a busy machine Ray alone takes minutes to start.
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "examples" / "ray_seeds.py"
@@ -118,12 +117,9 @@ def ancestors(process: int) -> list[int]:
     return found
 
 
-def process_in_the_middle(
-    study: "subprocess.Popen[str]", run: Path, deadline: float = 300.0
-) -> int:
+def process_in_the_middle(study: "subprocess.Popen[str]", run: Path) -> int:
     """Wait until a training has saved twice and is not through; return the process it runs in."""
-    end = time.monotonic() + deadline
-    while time.monotonic() < end and study.poll() is None:
+    while study.poll() is None:
         if len(list((run / "checkpoints").glob("*.json"))) == 2:
             assert not (run / "evaluation.csv").exists()
             log = run.with_name(run.name + ".log").read_text()
@@ -163,11 +159,11 @@ def test_killed_worker_changes_nothing(serial, tmp_path):
     log = out / "default-meta-seed0.log"
     with start(out, tmp_path) as study:
         os.kill(process_in_the_middle(study, out / "default-meta-seed0"), signal.SIGKILL)
-        with FileLock(out / "default-meta-seed0" / LOCK_FILE, timeout=5):
+        with FileLock(out / "default-meta-seed0" / LOCK_FILE, timeout=60):
             while log.read_text().count("process ") < 2 and study.poll() is None:
                 time.sleep(0.1)
             time.sleep(8)  # without waiting for the lock it would be tried by now
-        printed, _ = study.communicate(timeout=500)
+        printed, _ = study.communicate()
     assert study.returncode == 0, printed
     assert log.read_text().count("process ") == 2
     assert "going on from episode" in log.read_text()
@@ -185,7 +181,7 @@ def test_a_signal_stops_the_tasks_with_a_checkpoint(serial, tmp_path):
     with start(out, tmp_path) as study:
         process_in_the_middle(study, out / "default-meta-seed0")
         study.send_signal(signal.SIGTERM)
-        printed, _ = study.communicate(timeout=500)
+        printed, _ = study.communicate()
     assert study.returncode == 128 + signal.SIGTERM, printed
     assert "the same command goes on" in printed
     assert "stopped early" in (out / "default-meta-seed0.log").read_text()
@@ -199,7 +195,7 @@ def test_what_is_lost_too_often_is_reported(tmp_path):
     out = tmp_path / "study"
     with start(out, tmp_path, "--max-retries", "0") as study:
         os.kill(process_in_the_middle(study, out / "default-meta-seed0"), signal.SIGKILL)
-        printed, _ = study.communicate(timeout=500)
+        printed, _ = study.communicate()
     assert study.returncode == 1
     assert "error: these trainings failed: default-meta-seed0: " in printed
     assert not (out / "comparison.md").exists()
@@ -218,7 +214,7 @@ def test_lost_node_changes_nothing(serial, cluster, tmp_path):
         assert len(lost) == 1
         os.killpg(lost[0].pid, signal.SIGKILL)
         os.kill(process, signal.SIGKILL)
-        printed, _ = study.communicate(timeout=500)
+        printed, _ = study.communicate()
     assert study.returncode == 0, printed
     log = (out / "default-meta-seed0.log").read_text()
     assert log.count("process ") == 2

@@ -32,7 +32,6 @@ def build(docs: Path, site: Path) -> subprocess.CompletedProcess[str]:
         env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
         capture_output=True,
         text=True,
-        timeout=240,
         check=False,
     )
 

@@ -173,7 +173,6 @@ def test_actions_respect_the_masks(example: ModuleType) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 def test_example_learns(tmp_path: Path) -> None:
     """A minute's training of one core more than triples the return and solves nearly all."""
     command = [sys.executable, str(EXAMPLES / "torchrl_vdn.py"), "--problems", "200"]

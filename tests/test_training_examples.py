@@ -23,7 +23,6 @@ LEAST_SOLVED = {
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", sorted(LEAST_SOLVED))
 def test_training_example_learns(name: str, tmp_path: Path) -> None:
     """A minute of one core's training raises the return to above a quarter, and solves problems."""
