@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit  # type: ignore[import-untyped]
 from torch import Tensor, nn
+
+from mapp_env.compiled import nogil_kernel
 
 
 class Bag(nn.Module):
@@ -47,7 +48,7 @@ class SumRows(torch.autograd.Function):
         return torch.from_numpy(table), None
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@nogil_kernel
 def add_to_rows(table, indices, values):  # type: ignore[no-untyped-def]
     """Add values (B, units) to each of the table's rows (B, n) that they came from."""
     n_units = table.shape[1]

@@ -7,7 +7,8 @@ landmarks among the agents.
 """
 
 import numpy as np
-from numba import njit  # type: ignore[import-untyped]
+
+from mapp_env.compiled import nogil_kernel
 
 FAR = 1 << 20
 
@@ -36,7 +37,7 @@ def steps_left(
     return out
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@nogil_kernel
 def _steps_left(cells, landmarks, visited, moves, distances, out):  # type: ignore[no-untyped-def]
     n_agents, n_actions = cells.shape[1], moves.shape[1]
     n_landmarks = landmarks.shape[1]
@@ -88,7 +89,7 @@ def _steps_left(cells, landmarks, visited, moves, distances, out):  # type: igno
             out[row, joint] = team[n_agents - 1, everything]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@nogil_kernel
 def _through(members, start, left, routes, distances):  # type: ignore[no-untyped-def]
     """Return the shortest way from a cell through a set of landmarks."""
     if members == 0:

@@ -16,12 +16,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit  # type: ignore[import-untyped]
 
 from baselines.checkpoints import take
 from baselines.networks import NetworkSpec, split_joint
 from baselines.replay_memory import Batch
 from mapp_env import Grid
+from mapp_env.compiled import nogil_kernel
 
 UNKNOWN = -1
 
@@ -233,7 +233,7 @@ def is_on(cells: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
     return on
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@nogil_kernel
 def try_actions(
     cells, landmarks, visited, values, chances, temperature, moves, digits, distances, scale
 ):  # type: ignore[no-untyped-def]

@@ -3,10 +3,11 @@
 import math
 
 import numpy as np
-from numba import njit  # type: ignore[import-untyped]
+
+from mapp_env.compiled import nogil_kernel
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@nogil_kernel
 def arrange(observations, n, k, n_cells, sort):  # type: ignore[no-untyped-def]
     """Return what is to be looked up for global observations (B, N + 2K).
 
@@ -47,7 +48,7 @@ def arrange(observations, n, k, n_cells, sort):  # type: ignore[no-untyped-def]
     return pairs, landmarks, order
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@nogil_kernel
 def routes(pairs, landmarks, n_cells):  # type: ignore[no-untyped-def]
     """Return the agents' cells with every two unvisited landmarks: (B * N, K (K - 1) / 2).
 

@@ -160,6 +160,13 @@ def test_libraries_stay_in_their_places(path: Path) -> None:
                 assert not at_import, "importing mapp_env.rendering draws nothing"
 
 
+def test_compiling_stands_in_one_place() -> None:
+    """One file alone asks numba to compile, so that what is done without a cache is done by all."""
+    paths = [*FILES, *(REPOSITORY / "baselines").glob("*.py")]
+    askers = [p for p in paths if any(name.split(".")[0] == "numba" for name, _ in imports(p))]
+    assert askers == [PACKAGE / "compiled.py"]
+
+
 @pytest.mark.parametrize("folder", ["mapp_env", "baselines", "examples", "benchmarks", "tests"])
 def test_no_file_without_a_subject(folder: str) -> None:
     """No file is called utils, helpers, misc or common: each is called after what it holds."""

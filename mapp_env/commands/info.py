@@ -19,7 +19,7 @@ from importlib import metadata
 from typing import Any
 
 from mapp_env.commands.reports import add_json_option, print_report, words
-from mapp_env.compiled import cache_files, cache_folders
+from mapp_env.compiled import cache_files, cache_folders, is_compiled
 
 __all__ = ["add_arguments", "run", "versions_of"]
 
@@ -77,7 +77,7 @@ def _compiled_code() -> dict[str, Any]:
     """Return where compiled kernels are kept, and how much there is of them."""
     files, folders = cache_files(), cache_folders()
     return {
-        "compiled": bool(folders),
+        "compiled": is_compiled(),
         "cache": [str(folder) for folder in folders],
         "files": len(files),
         "bytes": sum(path.stat().st_size for path in files),
