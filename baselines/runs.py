@@ -35,6 +35,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+import mapp_env
 from mapp_env.files import (
     UNFINISHED,
     read_bytes,
@@ -57,7 +58,7 @@ LOCK_FILE = ".lock"
 MAX_TEXT_BYTES = 64 * 1024 * 1024  # no file of ours comes near; refuse to read more
 MAX_HEADER_BYTES = 1024  # of metrics.csv
 
-VERSIONED = ("mapp_env", "numpy", "numba", "torch", "gymnasium", "pettingzoo", "safetensors")
+VERSIONED = ("numpy", "numba", "torch", "gymnasium", "pettingzoo", "safetensors")
 
 
 class RunFolder:
@@ -307,6 +308,7 @@ def parse_json(text: str | bytes) -> Any:
 def describe_environment() -> dict[str, Any]:
     """Versions, commit, machine and command: what a reader needs to run this again."""
     versions: dict[str, str | None] = {"python": platform.python_version()}
+    versions["mapp_env"] = mapp_env.__version__  # what runs, which need not be what is installed
     for package in VERSIONED:
         try:
             versions[package] = metadata.version(package)

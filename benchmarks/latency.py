@@ -128,7 +128,7 @@ def load_fitting(name: str) -> NetworkPolicy:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--policies", nargs="*", default=pretrained_names(), help="of networks")
     parser.add_argument("--problems", type=int, default=100, help="one after another")
     parser.add_argument("--batch", type=int, default=20_000, help="handed over together")

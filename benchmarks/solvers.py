@@ -131,7 +131,8 @@ def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list
         found[name] = [method(problem, objective, seconds) for problem in problems]
     best = [min(results).cost for results in zip(*found.values(), strict=True)]
     if small:
-        assert best == [result.cost for result in found["exact"]], "below the optimum"
+        if best != [result.cost for result in found["exact"]]:
+            raise RuntimeError("a method has found less than the optimum")
     else:
         longer = [search(problem, objective, REFERENCE * seconds, seed=1) for problem in problems]
         best = [min(one, other.cost) for one, other in zip(best, longer, strict=True)]
@@ -149,7 +150,7 @@ def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=1.0, help="of each search")
     parser.add_argument("--instances", type=int, default=3, help="of each size")
     parser.add_argument("--grid", default="random", help="generator of the larger grids")

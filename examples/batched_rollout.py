@@ -15,7 +15,7 @@ import mapp_env
 
 def main() -> None:
     """Print success, mean cover time and speed."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--num-envs", type=int, default=4096, help="rows (default 4096)")
     parser.add_argument("--steps", type=int, default=500, help="steps of each row (default 500)")
     arguments = parser.parse_args()

@@ -137,7 +137,7 @@ def report(
 
 def main() -> None:
     """Judge random moves."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--problems", type=int, default=200, help="how many (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the moves (default 0)")
     arguments = parser.parse_args()

@@ -170,7 +170,7 @@ def greedy(algorithm: Algorithm, policies: str) -> Acting:
 
 def main() -> None:
     """Train, evaluate, print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--policies", choices=("shared", "independent"), default="shared")
     parser.add_argument("--seconds", type=float, default=60.0, help="of training (default 60)")
     parser.add_argument("--seed", type=int, default=0)

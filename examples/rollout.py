@@ -31,7 +31,7 @@ def spread_out(grid: mapp_env.Grid, state: np.ndarray, n_agents: int) -> list[in
 
 def main() -> None:
     """Write the animation and print what the episode cost."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--out", default="rollout.gif", help="where to write (default rollout.gif)")
     parser.add_argument("--seed", type=int, default=3, help="seed of the problem (default 3)")
     arguments = parser.parse_args()

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import tyro
 
+import mapp_env
 from baselines import evaluate, experiment, meta_dqn
 from baselines.figures import draw_learning_curves
 from baselines.options import preset_options
 from baselines.policy import load_policy
-from baselines.runs import RunFolder, read_config, read_metrics
+from baselines.runs import RunFolder, describe_environment, read_config, read_metrics
 from mapp_env import Grid
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,6 +73,12 @@ def two_runs(tmp_path_factory):
         assert errors == ""  # no warnings, and no progress bar where there is no terminal
         outputs.append(output)
     return folder, outputs
+
+
+def test_a_run_says_the_version_that_it_runs_with(monkeypatch):
+    """The environment's version is that of what was imported, not of what is installed."""
+    monkeypatch.setattr(mapp_env, "__version__", "9.8.7")
+    assert describe_environment()["versions"]["mapp_env"] == "9.8.7"
 
 
 def test_run_leaves_all_it_promises(two_runs):

@@ -79,6 +79,39 @@ def test_help_teaches(tmp_path: Path) -> None:
     assert all(f"{name}" in done.stdout for name in ("--plan", "--grid", "--seed", "warehouse"))
 
 
+WITHOUT_DOCSTRINGS = """
+import runpy, sys
+for line in sys.argv[1:]:
+    sys.argv = line.split()
+    try:
+        runpy.run_path(sys.argv[0], run_name="__main__")
+    except SystemExit as end:
+        assert not end.code, line
+"""
+
+
+def test_programs_start_without_docstrings(tmp_path: Path) -> None:
+    """With PYTHONOPTIMIZE=2, which drops all docstrings, every program starts and has a help."""
+    lines = ["mapp_env/__main__.py --version", "mapp_env/__main__.py --help"]
+    for module in COMMANDS:
+        lines.append(f"mapp_env/__main__.py {module.__name__.rpartition('.')[2]} --help")
+    # The others need torch or a trainer, some of which do not load without docstrings themselves.
+    scripts = ("rollout", "batched_rollout", "beside_optimum")
+    lines += [f"examples/{script}.py --help" for script in scripts]
+    lines += [f"benchmarks/{script}.py --help" for script in ("env_speed", "solvers")]
+    done = subprocess.run(
+        [sys.executable, "-OO", "-c", WITHOUT_DOCSTRINGS, *lines, "tests/golden/make.py --help"],
+        cwd=REPOSITORY,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY), "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"mapp_env {mapp_env.__version__}\nusage: ")
+    assert done.stdout.count("usage: ") == len(lines)
+
+
 def test_a_figure_needs_matplotlib_and_says_so(tmp_path: Path) -> None:
     """Without matplotlib a figure is refused with what to install; an animation needs none."""
     code = (

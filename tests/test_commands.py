@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import types
@@ -20,6 +21,7 @@ import pytest
 from PIL import Image
 
 import mapp_env
+from mapp_env import compiled
 from mapp_env.commands import info, main, solve, universe
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -153,6 +155,46 @@ def test_the_version_is_the_packages(capsys: pytest.CaptureFixture[str]) -> None
     with pytest.raises(SystemExit):
         main(["--version"])
     assert capsys.readouterr().out == f"mapp_env {mapp_env.__version__}\n"
+
+
+OWN_VERSION = """
+from mapp_env import compiled
+from mapp_env.commands import info, main
+info._accelerator = str  # importing torch takes seconds
+main(["info", "--json"])
+print(compiled._SOURCES)
+main(["--version"])
+"""
+
+
+def test_a_copy_says_its_own_version(tmp_path: Path) -> None:
+    """A copy in a folder or a zip is not what is installed: it says, and compiles, what it is."""
+    package = tmp_path / "folder" / "mapp_env"
+    shutil.copytree(
+        Path(mapp_env.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    top = package / "__init__.py"
+    text = top.read_text(encoding="utf-8")
+    assert text.count(f'"{mapp_env.__version__}"') == 1
+    text = text.replace(f'"{mapp_env.__version__}"', '"9.8.7"')
+    top.write_text(text, encoding="utf-8")
+    shutil.make_archive(str(package.parent), "zip", package.parent)
+    sources = set()
+    for place in (package.parent, package.parent.with_suffix(".zip")):
+        done = subprocess.run(
+            [sys.executable, "-c", OWN_VERSION],
+            env={**os.environ, "PYTHONPATH": str(place), "NUMBA_DISABLE_JIT": "1"},
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        *found, digest, said = done.stdout.splitlines()
+        assert said == "mapp_env 9.8.7"
+        assert json.loads("".join(found))["versions"]["mapp-env"] == "9.8.7"
+        sources.add(digest)
+    assert len(sources) == 1
+    assert compiled._SOURCES not in sources
 
 
 def test_info_tells_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:

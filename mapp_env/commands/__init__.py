@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
+from mapp_env import __version__
 from mapp_env.commands import info, render, solve, universe
 from mapp_env.commands.reports import OutputError
 
@@ -51,14 +52,13 @@ def main(command_line: Sequence[str] | None = None) -> int:
         prog=PROGRAM if os.path.basename(sys.argv[0]) == PROGRAM else "python -m mapp_env",
         description="Multi-agent path planning on walled grids, from the command line.",
     )
-    (version,) = info.versions_of(["mapp-env"]).values()
-    parser.add_argument("--version", action="version", version=f"mapp_env {version}")
+    parser.add_argument("--version", action="version", version=f"mapp_env {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in COMMANDS:
         text = (command.__doc__ or "").strip()
         sub = commands.add_parser(
             command.__name__.rpartition(".")[2],
-            help=text.splitlines()[0].rstrip("."),
+            help=text.partition("\n")[0].rstrip("."),
             description=text,
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,

@@ -18,12 +18,13 @@ from collections.abc import Iterable
 from importlib import metadata
 from typing import Any
 
+from mapp_env import __version__
 from mapp_env.commands.reports import add_json_option, print_report, words
 from mapp_env.compiled import cache_files, cache_folders, is_compiled
 
 __all__ = ["add_arguments", "run", "versions_of"]
 
-PACKAGES = ("mapp-env", "numpy", "numba", "gymnasium", "pettingzoo", "pillow")
+PACKAGES = ("numpy", "numba", "gymnasium", "pettingzoo", "pillow")
 EXTRAS = (
     *("matplotlib", "pygame-ce", "pyvrp", "torch", "supersuit", "stable-baselines3"),
     *("sb3-contrib", "torchrl", "ray"),
@@ -44,8 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Print what runs here."""
+    # Its own is that of what runs, which need not be what is installed.
+    own = {"python": platform.python_version(), "mapp-env": __version__}
     record: dict[str, Any] = {
-        "versions": {"python": platform.python_version(), **versions_of(PACKAGES)},
+        "versions": {**own, **versions_of(PACKAGES)},
         "extras": versions_of(EXTRAS),
         "compiled_code": _compiled_code(),
         "device": {

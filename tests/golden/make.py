@@ -164,7 +164,7 @@ def play_everything() -> str:
 
 def main() -> None:
     """Write the golden files, or print the digest."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--digest", action="store_true", help="print a digest, write nothing")
     if parser.parse_args().digest:
         print(play_everything())
