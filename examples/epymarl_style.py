@@ -25,8 +25,6 @@ import tyro
 from beside_optimum import check_options, report
 from torch import nn
 
-import mapp_env  # noqa: F401 - registers mapp_env/Tuple-v0
-
 
 @dataclass
 class Args:
@@ -150,7 +148,7 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)
     rng = np.random.default_rng(args.seed)
-    env = gymnasium.make("mapp_env/Tuple-v0", observation="geodesic")
+    env = gymnasium.make("mapp_env:mapp_env/Tuple-v0", observation="geodesic")
     env.reset(seed=args.seed)
     n_agents, limit = env.unwrapped.n_agents, env.unwrapped.task.max_cycles
     n_features = env.observation_space[0].shape[0] + n_agents

@@ -19,7 +19,6 @@ from beside_optimum import check_options, report
 from stable_baselines3 import DQN
 from stable_baselines3.common.env_util import make_vec_env
 
-import mapp_env  # noqa: F401 - registers mapp_env/Central-v0
 from mapp_env.adapters.sb3_returns import EpisodeReturns
 
 
@@ -48,7 +47,7 @@ def main(args: Args) -> None:
     check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     envs = make_vec_env(
-        "mapp_env/Central-v0",
+        "mapp_env:mapp_env/Central-v0",
         n_envs=args.num_envs,
         seed=args.seed,
         env_kwargs={"observation": "geodesic"},

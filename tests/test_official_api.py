@@ -6,6 +6,8 @@ import copy
 import functools
 import importlib.util
 import pickle
+import subprocess
+import sys
 import warnings
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -166,6 +168,30 @@ def test_gymnasium_registry(mode: str | None) -> None:
     assert rewards.shape == (2,)
     several.close()
     single.close()
+
+
+IN_A_WORKER = """
+import gymnasium
+if __name__ == "__main__":
+    central, several = (f"mapp_env:mapp_env/{name}-v0" for name in ("Central", "Tuple"))
+    assert not [name for name in gymnasium.registry if name.startswith("mapp_env")]
+    envs = gymnasium.vector.AsyncVectorEnv([lambda: gymnasium.make(central)], context="spawn")
+    print(envs.reset(seed=0)[0].shape)
+    envs.close()
+    print(gymnasium.make(central).spec.id, gymnasium.make(several).spec.id)
+"""
+
+
+def test_ids_are_known_where_only_gymnasium_is_imported() -> None:
+    """With the module in front, ids work in a fresh process, and in workers that are spawned."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", IN_A_WORKER],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["(1,", "13)", "mapp_env/Central-v0", "mapp_env/Tuple-v0"]
 
 
 def test_seven_agents_have_a_multidiscrete_action() -> None:
