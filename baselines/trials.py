@@ -47,7 +47,8 @@ class Trial(NamedTuple):
     @property
     def command(self) -> list[str]:
         """What starts it, or goes on with it."""
-        return [sys.executable, "-m", f"baselines.{self.algorithm}", *self.arguments]
+        # -P: what lies in the working folder is none of its modules.
+        return [sys.executable, "-P", "-m", f"baselines.{self.algorithm}", *self.arguments]
 
     @property
     def log(self) -> Path:

@@ -205,7 +205,7 @@ def start_times() -> None:
         runs = []
         for _ in range(4):
             output = subprocess.run(
-                [sys.executable, "-c", START], env=environ, check=True, capture_output=True
+                [sys.executable, "-P", "-c", START], env=environ, check=True, capture_output=True
             )
             runs.append([float(figure) for figure in output.stdout.split()])
     warm = runs[1:]

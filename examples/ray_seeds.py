@@ -108,12 +108,14 @@ def start_ray(address: str | None, jobs: int, max_retries: int) -> None:
     }
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     variables = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    ray.init(
-        address or "local",
-        log_to_driver=False,
-        runtime_env={"env_vars": variables},
-        **(here if address is None else {}),
-    )
+    # Workers search the folder that Ray is started in before their libraries.
+    with contextlib.chdir(ROOT):
+        ray.init(
+            address or "local",
+            log_to_driver=False,
+            runtime_env={"env_vars": variables},
+            **(here if address is None else {}),
+        )
 
 
 def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -> list[str]:

@@ -270,18 +270,56 @@ def test_a_policy_plays(folder: Path, capsys: pytest.CaptureFixture[str], loader
     assert (found["success"], found["cover_time"]) == (True, 2)
 
 
-def test_a_loader_lies_in_the_working_directory(folder: Path) -> None:
-    """The console script finds a module beside it, as `python -m mapp_env` does."""
+# Libraries that are loaded when they are needed; `python -m` itself lets others be shadowed.
+PLANTED = ("baselines", "matplotlib", "PIL", "pygame", "pyvrp", "safetensors", "torch", "tyro")
+
+
+@pytest.fixture
+def strangers(folder: Path) -> Path:
+    """Return the working folder, in which modules lie that are called like libraries."""
+    for name in PLANTED:
+        (folder / f"{name}.py").write_text("raise SystemExit('not the library')\n", "ascii")
+    return folder
+
+
+def test_nothing_is_imported_from_the_working_folder(strangers: Path) -> None:
+    """Neither way of starting takes a module that lies there for a library, nor does a child."""
+    script, module = [Path(sys.executable).parent / "mapp"], [sys.executable, "-m", "mapp_env"]
+    render = ["render", "--policy", "pretrained", "--landmarks", *CELLS, "--out", "a.png"]
+    told = []
+    for words in ([*script, "info", "--json"], [*module, *render]):
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, ""), words
+        told.append(done.stdout)
+    assert metadata.version("torch") in json.loads(told[0])["device"]["accelerator_for_learners"]
+
+
+def test_a_loader_lies_in_the_working_directory(strangers: Path) -> None:
+    """The console script finds a module beside it, but takes nothing there for a library."""
+    folder = strangers
+    (folder / "steps.py").write_text("RIGHT = 1\n", encoding="ascii")
     (folder / "strollers.py").write_text(
+        "import PIL, safetensors\n"
         "class load:\n"
-        "    def __init__(self, name): pass\n"
-        "    def act(self, observations): return [[1, 1, 1]] * len(observations)\n",
+        "    def __init__(self, name): from steps import RIGHT; self.moves = [RIGHT] * 3\n"
+        "    def act(self, observations): return [self.moves] * len(observations)\n",
         encoding="ascii",
     )
     script = Path(sys.executable).parent / "mapp"
     options = ["--out", "a.gif", "--policy", "x", "--policy-loader", "strollers:load"]
     done = subprocess.run([script, "render", *options, "--landmarks", "26"], capture_output=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_loader_leaves_the_search_path_as_it_was(
+    folder: Path, loader: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """When a loader is done, or has failed, the working folder is searched no more."""
+    before = sys.path.copy()
+    for name in ("3", "three"):
+        main(["render", "--policy", name, "--policy-loader", loader, "--out", "a.gif"])
+        assert sys.path == before
+    capsys.readouterr()
 
 
 def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

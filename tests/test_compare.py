@@ -166,13 +166,18 @@ def test_updates_of_the_default_preset_can_be_fewer(tmp_path):
     assert updates == {"default": 7, "paper": 0}
 
 
-def test_failed_training_is_reported(tmp_path):
-    """What a training said last is said again, with its name."""
+def test_failed_training_is_reported(tmp_path, monkeypatch):
+    """What a training said last is said again, with its name.
+
+    It is one's own training: none of its modules is looked for in the working folder.
+    """
+    (tmp_path / "torch.py").write_text("raise SystemExit('not the library')\n")
+    monkeypatch.chdir(tmp_path)
     words = [*WORDS, "--n-landmarks", "60"]
-    args = tiny(tmp_path, learners=("meta",), seeds=1)
+    args = tiny(tmp_path / "study", learners=("meta",), seeds=1)
     with pytest.raises(ValueError, match=r"failed: paper-meta-seed0: error: .*landmarks"):
         compare.main(args, words)
-    assert not (tmp_path / "comparison.md").exists()
+    assert not (tmp_path / "study" / "comparison.md").exists()
 
 
 def test_a_signal_stops_all_trainings(tmp_path, monkeypatch, capsys):

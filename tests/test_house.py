@@ -202,6 +202,18 @@ def public_definitions() -> list[tuple[str, ast.AST]]:
     return found
 
 
+def test_a_python_that_is_started_searches_no_working_folder() -> None:
+    """Each interpreter that is started here gets -P: else `-c` and `-m` search there first."""
+    started = 0
+    for name in ("mapp_env", "baselines", "examples", "benchmarks"):
+        for path in sorted((REPOSITORY / name).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.List) and ast.unparse(node).startswith("[sys.executable"):
+                    started += 1
+                    assert ast.unparse(node.elts[1]) == "'-P'", f"{path}:{node.lineno}"
+    assert started >= 3
+
+
 def test_public_names_are_documented() -> None:
     """Every module and every public class, function and method has a docstring of its own."""
     definitions = public_definitions()

@@ -43,6 +43,8 @@ def start(out: Path, home: Path, *words: str) -> Iterator["subprocess.Popen[str]
     for name, value in GRID.items():
         values = value if isinstance(value, tuple) else (str(value),)
         command += [f"--{name.replace('_', '-')}", *values]
+    # Ray lets workers search the folder that it is started in.
+    (home / "torch.py").write_text("raise SystemExit('not the library')\n")
     # Ray keeps a token in the home folder.
     environment = {**os.environ, "HOME": str(home), "RAY_USAGE_STATS_ENABLED": "0"}
     with subprocess.Popen(

@@ -91,8 +91,8 @@ def _accelerator() -> str | None:
     """Return what torch would compute on beside the processor; None without torch."""
     if versions_of(("torch",))["torch"] is None:
         return None
-    done = subprocess.run(
-        [sys.executable, "-c", ACCELERATOR], capture_output=True, text=True, check=False
+    done = subprocess.run(  # -P: not a torch.py of the working folder
+        [sys.executable, "-P", "-c", ACCELERATOR], capture_output=True, text=True, check=False
     )
     return done.stdout.strip() if done.returncode == 0 else "torch cannot be imported"
 

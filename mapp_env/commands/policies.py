@@ -6,9 +6,11 @@ a policy is asked for; by default it is that of the baselines that are developed
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -40,7 +42,8 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
     name : str
         Of the policy, as the loader knows it.
     loader : str
-        ``MODULE:FUNCTION``, also of a module in the working directory.
+        ``MODULE:FUNCTION``. While another than the default one loads, it and what it imports may
+        also lie in the working directory, if nowhere else.
 
     Raises
     ------
@@ -52,29 +55,46 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
     module, _, function = loader.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), function)):
         raise ValueError(f"--policy-loader must be MODULE:FUNCTION, got {describe(loader)}")
-    if os.getcwd() not in sys.path:  # `python -m` has it there, a console script has not
-        sys.path.insert(0, os.getcwd())
-    try:
-        load = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        hint = (
-            ': install the repository in editable mode, pip install -e ".[baselines]"'
-            if loader == DEFAULT_LOADER
-            else ""
-        )
-        raise ImportError(f"policies are loaded by {loader}, but: {error}{hint}") from error
-    except Exception as error:  # whatever it is, it is the loader's, not ours
-        raise ValueError(f"--policy-loader {loader} cannot be imported: {error!r}") from error
-    try:
-        policy: Policy = load(name)
-    except Exception as error:  # whatever it is, it is the loader's, not ours
-        reason = str(error) if isinstance(error, ValueError) else repr(error)
-        raise ValueError(f"--policy {describe(name)}: {loader} refuses it: {reason}") from error
+    with contextlib.nullcontext() if loader == DEFAULT_LOADER else _working_folder_last():
+        try:
+            load = getattr(importlib.import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            hint = (
+                ': install the repository in editable mode, pip install -e ".[baselines]"'
+                if loader == DEFAULT_LOADER
+                else ""
+            )
+            raise ImportError(f"policies are loaded by {loader}, but: {error}{hint}") from error
+        except Exception as error:  # whatever it is, it is the loader's, not ours
+            raise ValueError(f"--policy-loader {loader} cannot be imported: {error!r}") from error
+        try:
+            policy: Policy = load(name)
+        except Exception as error:  # whatever it is, it is the loader's, not ours
+            reason = str(error) if isinstance(error, ValueError) else repr(error)
+            raise ValueError(f"--policy {describe(name)}: {loader} refuses it: {reason}") from error
     if not callable(getattr(policy, "act", None)):
         raise ValueError(
             f"--policy-loader must return something with act(), {loader} returns {describe(policy)}"
         )
     return policy
+
+
+@contextlib.contextmanager
+def _working_folder_last() -> Iterator[None]:
+    """Search the working folder for modules, after all others and not for long.
+
+    What happens to lie there and is called torch.py must not be taken for the library.
+    """
+    folder = os.getcwd()
+    if folder in sys.path:
+        yield
+        return
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):  # the loader may have removed it
+            sys.path.remove(folder)
 
 
 def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
