@@ -11,12 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.dynamics import WAIT
-from mapp_env.files import MAX_INTEGER, MAX_PLAN_BYTES, FileError, read_record, write_record
+from mapp_env.files import (
+    MAX_INTEGER,
+    MAX_PLAN_BYTES,
+    FileError,
+    Record,
+    read_record,
+    write_record,
+)
 from mapp_env.playing import Played, check_joint_actions, play
-from mapp_env.problem import Problem
+from mapp_env.problem import MAX_CYCLES, Problem
 from mapp_env.tour_checks import check_claims, check_tours
 from mapp_env.validation import as_integer, as_real, check_choice, describe
-from mapp_env.walking import walk_tours
+from mapp_env.walking import moves_of, tour_of, walk_tours
 
 __all__ = ["OBJECTIVES", "STATUSES", "Plan", "replay"]
 
@@ -24,6 +31,9 @@ OBJECTIVES = ("cover_time", "makespan", "total_distance")
 STATUSES = ("optimal", "feasible", "infeasible")
 
 MAX_SOLVER_LETTERS = 100
+
+MAX_LISTED_CELLS = 100_000
+"""Most cells that a file lists, all tours together; in a larger plan, a tour is its moves."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +159,13 @@ class Plan:
         """
         self._verify(problem)
 
-    def _verify(self, problem: Problem | None = None) -> tuple[Problem, Played]:
-        """Verify, and return the problem and what the rules make of the plan."""
+    def _verify(
+        self, problem: Problem | None = None, actions: NDArray[np.int64] | None = None
+    ) -> tuple[Problem, Played]:
+        """Verify, and return the problem and what the rules make of the plan.
+
+        ``actions`` are the plan's own, shape (T, N), if they are at hand as an array.
+        """
         problem = self.problem if problem is None else problem
         if not isinstance(problem, Problem):
             raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
@@ -163,10 +178,11 @@ class Plan:
         check_tours(problem, self.tours)
         check_claims(problem, self.tours, self.claims, self.success)
         unlimited = replace(problem, max_cycles=None)
-        actions = self.actions
-        if not actions and any(self.tours):
-            actions = tuple(map(tuple, walk_tours(unlimited, self.tours).tolist()))
-        played = play(unlimited, check_joint_actions(actions, problem.n_agents))
+        if actions is None and not self.actions and any(self.tours):
+            actions = walk_tours(unlimited, self.tours)
+        if actions is None:
+            actions = check_joint_actions(self.actions, problem.n_agents)
+        played = play(unlimited, actions)
         for name in (*OBJECTIVES, "claims", "tours"):
             stated, given = getattr(self, name), getattr(played, name)
             if stated != given:
@@ -210,6 +226,9 @@ class Plan:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the plan and its problem as JSON, whole or not at all.
 
+        Tours are lists of cells. If there are more than 100,000 cells in all, each tour is instead
+        a string of its moves from the depot, a digit each, as the actions are.
+
         Parameters
         ----------
         path : str or os.PathLike
@@ -228,9 +247,11 @@ class Plan:
         Raises
         ------
         ValueError
-            If the plan is not right (:meth:`verify`).
+            If the plan is not right (:meth:`verify`), or longer than any episode.
         """
         problem, played = self._verify()
+        if len(played.actions) > MAX_CYCLES:
+            raise FileError(f"plan: has {len(played.actions)} steps, a file holds {MAX_CYCLES}")
         # As played: what is equal but of another type, NumPy's integers say, is no JSON.
         columns = zip(*played.actions, strict=True) if played.actions else [()] * len(self.tours)
         return {
@@ -241,7 +262,7 @@ class Plan:
             "seconds": float(self.seconds),
             "bound": None if self.bound is None else int(self.bound),
             **{name: _or_null(getattr(played, name)) for name in OBJECTIVES},
-            "tours": played.tours,
+            "tours": _spelled(problem, played.tours),
             "claims": played.claims,
             "claim_steps": played.claim_steps,
             "actions": ["".join(map(str, column)) for column in columns],
@@ -265,17 +286,22 @@ class Plan:
         problem = Problem.from_record(source.record("problem"))
         n_agents = problem.n_agents
         columns = source.strings("actions", n_agents, "01234")
-        if len({len(column) for column in columns}) > 1:
+        n_steps = len(columns[0])
+        if {len(column) for column in columns} != {n_steps}:
             raise source.error("actions", "must be equally long for all agents")
+        if n_steps > MAX_CYCLES:
+            raise source.error("actions", f"must be of at most {MAX_CYCLES} steps", n_steps)
+        letters = np.frombuffer("".join(columns).encode("ascii"), np.uint8)
+        actions = (letters.reshape(n_agents, n_steps).T - ord("0")).astype(np.int64, order="C")
         costs = {name: source.number(name, null=math.inf) for name in OBJECTIVES}
         plan = cls(
-            tours=source.cell_lists("tours", n_agents),
+            tours=_read_tours(source, problem, n_steps),
             claims=source.cell_lists("claims", n_agents),
             **costs,
             objective=source.choice("objective", OBJECTIVES),
             status=source.choice("status", STATUSES),
             claim_steps=source.cell_lists("claim_steps", n_agents),
-            actions=tuple(tuple(map(int, step)) for step in zip(*columns, strict=True)),
+            actions=tuple(map(tuple, actions.tolist())),
             solver=source.text("solver", MAX_SOLVER_LETTERS),
             seconds=source.real("seconds"),
             bound=source.number("bound", null=None),
@@ -283,10 +309,30 @@ class Plan:
         )
         source.finish()
         try:
-            plan.verify()
+            plan._verify(actions=actions)
         except ValueError as error:
             raise FileError(f"{source.where}: {error}") from error
         return plan
+
+
+def _spelled(problem: Problem, tours: tuple[tuple[int, ...], ...]) -> Any:
+    """Return tours as files hold them: their cells, or where these would be too many, their moves.
+
+    A file must hold what a solver finds; a cell takes up to eight letters, a move one.
+    """
+    if sum(map(len, tours)) <= MAX_LISTED_CELLS:
+        return tours
+    return [moves_of(problem.grid, tour) for tour in tours]
+
+
+def _read_tours(source: Record, problem: Problem, n_steps: int) -> tuple[tuple[int, ...], ...]:
+    """Return tours from a file: cells, or moves."""
+    if not source.holds_strings("tours"):
+        return source.cell_lists("tours", problem.n_agents)
+    moves = source.strings("tours", problem.n_agents, "0123")
+    if max(map(len, moves)) > n_steps + problem.grid.n_cells:
+        raise source.error("tours", "must be the actions' moves and a way home")
+    return tuple(tour_of(problem.grid, line) for line in moves)
 
 
 def _or_null(cost: float) -> int | None:

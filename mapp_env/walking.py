@@ -12,7 +12,7 @@ from mapp_env.dynamics import WAIT
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
 
-__all__ = ["tour_through", "walk_tours"]
+__all__ = ["moves_of", "tour_of", "tour_through", "walk_tours"]
 
 
 def tour_through(grid: Grid, landmarks: Iterable[int]) -> tuple[int, ...]:
@@ -62,10 +62,32 @@ def walk_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> NDArray[np.i
     for agent, tour in enumerate(tours):
         cells = np.array(tour[: len(actions) + 1], np.int64)
         walked = max(len(cells) - 1, 0)
-        ways = grid.moves[cells[:-1]]
-        actions[:walked, agent] = (ways == cells[1:, None]).argmax(axis=1)
+        actions[:walked, agent] = _moves(grid, cells)
         actions[walked:, agent] = _idle_actions(grid, claims, agent, walked, len(actions))
     return actions
+
+
+def _moves(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the moves between cells, neighbours in turn."""
+    ways = grid.moves[cells[:-1]]
+    moves: NDArray[np.int64] = (ways == cells[1:, None]).argmax(axis=1)
+    return moves
+
+
+def moves_of(grid: Grid, tour: Sequence[int]) -> str:
+    """Return the moves of a tour, a digit each: 0 left, 1 right, 2 up, 3 down."""
+    moves = _moves(grid, np.array(tour, np.int64))
+    return (moves + ord("0")).astype(np.uint8).tobytes().decode("ascii")
+
+
+def tour_of(grid: Grid, moves: str) -> tuple[int, ...]:
+    """Return the cells from the depot on that moves lead to, walls and borders unheeded."""
+    if not moves:
+        return ()
+    ways = np.array([-1, 1, -grid.cols, grid.cols])
+    digits = np.frombuffer(moves.encode("ascii"), np.uint8) - ord("0")
+    cells = np.cumsum(np.append(grid.depot, ways[digits]))
+    return tuple(cells.tolist())
 
 
 def _idle_actions(

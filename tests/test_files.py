@@ -92,6 +92,102 @@ def test_the_largest_grid_fits(tmp_path: Path) -> None:
     assert Plan.load(tmp_path / "plan.json") == plan
 
 
+def corridor_end() -> Problem:
+    """Return a problem for 16 agents: dead ends off the far end of the longest corridor."""
+    walls = np.zeros((512, 512), bool)
+    walls[1::2] = True
+    walls[1::4, -1] = walls[3::4, 0] = False
+    walls[508:] = True
+    walls[507:, :32:2] = False
+    return Problem(Grid(walls, 0), range(511 * 512, 511 * 512 + 32, 2), 16)
+
+
+def test_what_is_solved_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The plan of agents that walk 130,000 cells and back is printed, written alike, and read."""
+    problem = corridor_end()
+    problem.save(tmp_path / "problem.json")
+    out = tmp_path / "plan.json"
+    command = ["solve", "--problem", str(tmp_path / "problem.json"), "--json", "--out", str(out)]
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(out.read_text())
+    plan = Plan.load(out)
+    assert (plan.problem, plan.status) == (problem, "optimal")
+    assert sum(map(len, plan.tours)) > 2_500_000
+
+
+def to_and_fro(n_cells: int) -> Plan:
+    """Return a plan with one tour of an odd number of cells."""
+    problem = Problem(Grid.from_text("D...\n...."), (2,), 1)
+    return replay(problem, [[1], [0]] * (n_cells // 2 - 2) + [[1], [1]])
+
+
+def test_long_tours_are_kept_as_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above a number of cells a file holds moves; both forms are read, whatever the length."""
+    monkeypatch.setattr(mapp_env.plan, "MAX_LISTED_CELLS", 9)
+    path = tmp_path / "plan.json"
+    for n_cells in (7, 9, 11, 13):
+        plan = to_and_fro(n_cells)
+        cells = list(plan.tours[0])
+        moves = "10" * (n_cells // 2 - 2) + "1100"
+        assert len(cells) == n_cells
+        plan.save(path)
+        fields = json.loads(path.read_text())
+        assert fields["tours"] == [moves if n_cells > 9 else cells]
+        for tour in (cells, moves):
+            path.write_text(json.dumps({**fields, "tours": [tour]}))
+            assert Plan.load(path) == plan
+
+
+@pytest.mark.parametrize(
+    "moves",
+    ["", "1100", "101100 ", "1011004", "10110", "1011001", "110100", "131020", "1010101100",
+     "1" * 100, "0" * 100, "3" * 100, "2" * 100],
+)  # fmt: skip
+def test_no_other_moves_are_read(moves: str, tmp_path: Path) -> None:
+    """Moves that are not the tour's, leave the grid or are no moves at all are refused."""
+    path = tmp_path / "plan.json"
+    plan = to_and_fro(7)
+    plan.save(path)
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps({**fields, "tours": ["101100"]}))
+    assert Plan.load(path) == plan
+    path.write_text(json.dumps({**fields, "tours": [moves]}))
+    with pytest.raises(FileError, match=r"plan\.json: "):
+        Plan.load(path)
+
+
+def test_tours_are_all_of_one_form(tmp_path: Path) -> None:
+    """A list of cells beside a string of moves is refused."""
+    path = tmp_path / "plan.json"
+    replay(Problem(Grid.from_text("D...\n...."), (2, 4), 2), [[1, 3], [1, 1]]).save(path)
+    fields = json.loads(path.read_text())
+    assert fields["tours"] == [[0, 1, 2, 1, 0], [0, 4, 0]]
+    path.write_text(json.dumps({**fields, "tours": ["1100", "32"]}))
+    Plan.load(path)
+    for tours in (["1100", [0, 4, 0]], [[0, 1, 2, 1, 0], "32"], ["1100"], ["1100", "32", ""]):
+        path.write_text(json.dumps({**fields, "tours": tours}))
+        with pytest.raises(FileError, match="field 'tours"):
+            Plan.load(path)
+
+
+def test_no_file_is_longer_than_an_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan of as many steps as an episode may have is kept; of one more, not written or read."""
+    assert mapp_env.plan.MAX_CYCLES == 1_000_000
+    monkeypatch.setattr(mapp_env.plan, "MAX_CYCLES", 6)
+    path = tmp_path / "plan.json"
+    problem = Problem(Grid.from_text("D."), (1,), 1)
+    plan = replay(problem, [[4]] * 6)
+    plan.save(path)
+    assert Plan.load(path) == plan
+    text = path.read_text()
+    with pytest.raises(FileError, match="has 7 steps, a file holds 6"):
+        replay(problem, [[4]] * 7).save(path)
+    assert path.read_text() == text
+    path.write_text(text.replace('["444444"]', '["4444444"]'))
+    with pytest.raises(FileError, match="'actions' must be of at most 6 steps, got 7"):
+        Plan.load(path)
+
+
 # -- what strangers may send ---------------------------------------------
 
 
@@ -233,6 +329,16 @@ def test_hostile_files_are_refused(kind: str, name: str, tmp_path: Path) -> None
     with pytest.raises(FileError, match=r"hostile\.json") as caught:
         load(kind, path)
     assert len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize("part", ["[],", "{},", '"",', '{"a":1},', "[" * 400 + "]" * 400 + ","])
+@pytest.mark.parametrize("kind", ["problem", "plan"])
+def test_files_of_many_parts_are_refused(kind: str, part: str, tmp_path: Path) -> None:
+    """What no file of a kind holds, millions of lists, objects or strings, is not even parsed."""
+    path = tmp_path / "hostile.json"
+    path.write_text(f'{{"format": "mapp_env {kind}", "x": [{part * 1000}0]}}')
+    with pytest.raises(FileError, match="has more than 1000 brackets, colons and quotes"):
+        load(kind, path)
 
 
 @pytest.mark.parametrize("kind", ["problem", "plan"])
