@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import stat
 import tempfile
 from collections.abc import Callable, Iterator
@@ -725,3 +726,22 @@ def test_vrplib_is_read_by_an_independent_reader(tmp_path: Path) -> None:
         assert instance["vehicles"] == 4
         assert instance["demand"].tolist() == [0] + [1] * n_landmarks
         assert instance["depot"].tolist() == [0]
+
+
+def test_vrplib_fields_survive_a_reader_that_knows_tsplib_alone(tmp_path: Path) -> None:
+    """Where an unknown line is more of the field above, as for tsplib95, only the comment grows."""
+    save_vrplib(PROBLEM, tmp_path / "problem.vrp")
+    text = (tmp_path / "problem.vrp").read_text()
+    known = "NAME|COMMENT|TYPE|DIMENSION|CAPACITY|EDGE_WEIGHT_TYPE|EDGE_WEIGHT_FORMAT"
+    fields = dict(
+        re.findall(rf"^({known}) : (.*?)\n(?=(?:{known}) :|\w+_SECTION)", text, re.M | re.S)
+    )
+    assert fields.pop("COMMENT").endswith("\nVEHICLES : 2")
+    assert fields == {
+        "NAME": "mapp_env",
+        "TYPE": "CVRP",
+        "DIMENSION": "5",
+        "CAPACITY": "4",
+        "EDGE_WEIGHT_TYPE": "EXPLICIT",
+        "EDGE_WEIGHT_FORMAT": "FULL_MATRIX",
+    }

@@ -37,8 +37,9 @@ def save_vrplib(problem: Problem, path: str | os.PathLike[str]) -> None:
     lines = [
         "NAME : mapp_env",
         f"COMMENT : {problem.n_agents} agents, depot and landmarks on a walled grid",
-        "TYPE : CVRP",
+        # tsplib95, which does not know it, takes the line for more of the field above.
         f"VEHICLES : {problem.n_agents}",
+        "TYPE : CVRP",
         f"DIMENSION : {len(distances)}",
         f"CAPACITY : {len(problem.landmarks)}",
         "EDGE_WEIGHT_TYPE : EXPLICIT",
