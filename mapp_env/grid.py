@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +24,7 @@ MAX_ALL_PAIRS_CELLS = 4096
 UNREACHABLE = -1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, init=False, repr=False)
 class Grid:
     """A walled grid with a depot.
 
@@ -42,6 +44,8 @@ class Grid:
         Read-only.
     depot : int
         The depot's cell.
+    text : str
+        Both, as rows of ``#``, ``.`` and ``D``, which :meth:`from_text` reads back.
 
     Raises
     ------
@@ -50,8 +54,12 @@ class Grid:
         ``depot`` is not a free cell.
     """
 
-    walls: NDArray[np.bool_]  # (rows, cols) bool, read-only
-    depot: int = None  # type: ignore[assignment]
+    # The only field: what dataclasses.asdict, and so Gymnasium's EnvSpec.to_json, makes of a grid
+    # has to be text.
+    text: str
+    if TYPE_CHECKING:
+        walls: NDArray[np.bool_]
+        depot: int
 
     def __init__(self, walls: ArrayLike, depot: object = None) -> None:
         if not isinstance(walls, np.ndarray | list | tuple):
@@ -80,6 +88,10 @@ class Grid:
         if array.flat[cell]:
             raise ValueError(f"depot must be a free cell, got {describe(depot)}, which is a wall")
         object.__setattr__(self, "depot", cell)
+        letters = np.full((self.rows, self.cols + 1), ord("\n"), np.uint8)
+        letters[:, :-1] = np.where(array, ord("#"), ord("."))
+        letters[divmod(cell, self.cols)] = ord("D")
+        object.__setattr__(self, "text", letters.tobytes()[:-1].decode("ascii"))
 
     # -- reading and writing -----------------------------------------------------------
 
@@ -90,7 +102,9 @@ class Grid:
         Parameters
         ----------
         text : str
-            ``#``, ``@``, ``T``, ``O`` are walls; ``.``, ``G`` free cells; ``D`` the depot.
+            ``#``, ``@``, ``T``, ``O`` are walls; ``.``, ``G`` free cells; ``D`` the depot. Where it
+            starts with a line break, as a triple-quoted string may, all lines may be indented
+            alike.
         depot : int or (int, int), optional
             Overrides the text's depot; without either, the free cell nearest to the centre.
 
@@ -101,6 +115,8 @@ class Grid:
         """
         if not isinstance(text, str):
             raise ValueError(f"text must be a str of map rows, got {describe(text)}")
+        if text.startswith("\n"):
+            text = textwrap.dedent(text)
         return cls._from_parsed(parse_map(text), depot, "text")
 
     @classmethod
@@ -139,10 +155,8 @@ class Grid:
             raise MapError(f"{source}: {error}") from error
 
     def to_text(self) -> str:
-        """Return the grid as rows of ``#``, ``.`` and ``D``, which :meth:`from_text` reads back."""
-        letters = np.where(self.walls, "#", ".")
-        letters.flat[self.depot] = "D"
-        return "\n".join("".join(row) for row in letters)
+        """Return :attr:`text`."""
+        return self.text
 
     # -- shape and cells ---------------------------------------------------------------
 
@@ -297,14 +311,6 @@ class Grid:
         return tuple(path.tolist())
 
     # -- identity ----------------------------------------------------------------------
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Grid):
-            return NotImplemented
-        return self.depot == other.depot and np.array_equal(self.walls, other.walls)
-
-    def __hash__(self) -> int:
-        return hash((self.walls.shape, self.walls.tobytes(), self.depot))
 
     def __reduce__(self) -> tuple[type[Grid], tuple[NDArray[np.bool_], int]]:
         """Copy by building anew, as copies of read-only arrays would not be read-only."""

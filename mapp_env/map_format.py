@@ -8,6 +8,7 @@ same rows below a header of ``type``, ``height``, ``width`` and ``map`` lines, a
 
 from __future__ import annotations
 
+import codecs
 import re
 from typing import NamedTuple
 
@@ -57,11 +58,14 @@ def read_map(source: str) -> ParsedMap:
         is read before the file is known to be regular, so that a pipe or a device cannot block.
     """
     data = read_bytes(source, MAX_FILE_BYTES, "a map file", MapError)
+    data = data.removeprefix(codecs.BOM_UTF8)  # as editors of some systems write it
     try:
         text = data.decode("ascii")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise MapError(f"{source}:{line}: holds a byte that is not ASCII text") from error
+        utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        found = "UTF-16's byte order mark" if utf16 else f"the byte 0x{data[error.start]:02x}"
+        raise MapError(f"{source}:{line}: holds {found}, which is not ASCII text") from error
     return parse_map(text, source)
 
 
@@ -71,8 +75,8 @@ def parse_map(text: str, source: str = "text") -> ParsedMap:
     Parameters
     ----------
     text : str
-        The rows, one a line. Indentation common to all lines and empty lines at either end are
-        ignored, so that a triple-quoted string works as it looks.
+        The rows, one a line. Empty lines at either end are ignored, and so are blanks after rows,
+        unless they make up a column.
     source : str
         How messages call the text: a path, for a file.
 
@@ -83,9 +87,9 @@ def parse_map(text: str, source: str = "text") -> ParsedMap:
     """
     if len(text) > MAX_FILE_BYTES:
         raise MapError(f"{source}: has {len(text)} characters, a map may have {MAX_FILE_BYTES}")
-    lines = [line.rstrip(" \t") for line in re.split(r"\r\n|\r|\n", text)]
-    indents = [len(line) - len(line.lstrip(" ")) for line in lines if line]
-    lines = [line[min(indents) :] if line else line for line in lines]
+    lines = re.split(r"\r\n|\r|\n", text.removeprefix("\ufeff"))
+    if not all(line.endswith((" ", "\t")) for line in lines if line):
+        lines = [line.rstrip(" \t") or line for line in lines]
     first = 0
     while first < len(lines) and not lines[first]:
         first += 1
@@ -94,7 +98,7 @@ def parse_map(text: str, source: str = "text") -> ParsedMap:
         last -= 1
     if first == last:
         raise MapError(f"{source}:1: holds no rows")
-    if lines[first].split()[0] == "type":
+    if lines[first].split()[:1] == ["type"]:
         height, width, first = _read_header(lines, first, source)
         if last - first != height:
             raise MapError(f"{source}:{last}: has {last - first} rows, its header says {height}")

@@ -163,16 +163,17 @@ def check_landmarks(
         If the number is wrong, or a cell is off the grid, a wall, the depot, unreachable or named
         twice.
     """
+    given = landmarks
     if isinstance(landmarks, np.ndarray):
         landmarks = list(landmarks) if landmarks.ndim > 0 else None
     if not isinstance(landmarks, Sequence) or isinstance(landmarks, str | bytes):
         raise ValueError(
-            f"{name} must be a sequence of cells or of (row, col) pairs, got {describe(landmarks)}"
+            f"{name} must be a sequence of cells or of (row, col) pairs, got {describe(given)}"
         )
     low, high = (1, MAX_LANDMARKS) if count is None else (count, count)
     if not low <= len(landmarks) <= high:
         allowed = f"1..{MAX_LANDMARKS}" if count is None else str(count)
-        raise ValueError(f"{name} must hold {allowed} cells, got {describe(landmarks)}")
+        raise ValueError(f"{name} must hold {allowed} cells, got {describe(given)}")
     cells: list[int] = []
     for index, value in enumerate(landmarks):
         label = f"{name}[{index}]"

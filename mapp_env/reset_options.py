@@ -48,14 +48,19 @@ def check_problems(
         If they are none of the task's.
     """
     landmarks = None if options is None else options.get("landmarks")
-    if isinstance(landmarks, np.ndarray) and landmarks.ndim == 2:
-        n_landmarks = task.n_landmarks
-        if landmarks.shape == (num_envs, n_landmarks):
-            if landmarks.shape == (n_landmarks, 2):
-                raise ValueError(
-                    "options['landmarks'] of shape (2, 2) may mean a cell for each of 2 rows "
-                    "or (row, col) pairs: pass pairs as a list, or reset row by row"
-                )
+    if isinstance(landmarks, np.ndarray) and landmarks.ndim > 1:
+        rows, pairs = (num_envs, task.n_landmarks), (task.n_landmarks, 2)
+        if landmarks.shape not in (rows, pairs):
+            raise ValueError(
+                f"options['landmarks'] must be of shape {rows}, cells for each row, or {pairs}, "
+                f"(row, col) pairs for all; got shape {landmarks.shape}"
+            )
+        if rows == pairs:
+            raise ValueError(
+                "options['landmarks'] of shape (2, 2) may mean a cell for each of 2 rows "
+                "or (row, col) pairs: pass pairs as a list, or reset row by row"
+            )
+        if landmarks.shape == rows:
             return _check_cells(landmarks, task), None
     problem = task.check_options(options)
     if problem is None:

@@ -253,6 +253,9 @@ def _names(kinds: type[Reward] | type[Observation]) -> tuple[str, ...]:
 def find_grid(grid: object) -> Grid:
     """Return the grid meant by a grid, a bundled name or a path to a map file.
 
+    A dict of a grid's text is one, too: what is left of a grid in the JSON of an environment's
+    spec.
+
     Raises
     ------
     ValueError
@@ -260,6 +263,11 @@ def find_grid(grid: object) -> Grid:
     """
     if isinstance(grid, Grid):
         return grid
+    if isinstance(grid, Mapping) and set(grid) == {"text"}:
+        try:
+            return Grid.from_text(grid["text"])
+        except ValueError as error:
+            raise ValueError(f"grid: {error}") from error
     if isinstance(grid, str) and grid in grid_names():
         return make_grid(grid)
     if isinstance(grid, os.PathLike) or (isinstance(grid, str) and os.path.lexists(grid)):
@@ -269,7 +277,8 @@ def find_grid(grid: object) -> Grid:
             f"grid must be a mapp_env.Grid, a bundled name or a map file: "
             f"mapp_env.make_grid({grid!r}) generates one; got {grid!r}"
         )
+    missing = ", and there is no such file" if isinstance(grid, str) else ""
     raise ValueError(
         f"grid must be a mapp_env.Grid, a bundled name ({', '.join(grid_names())}) or a path to a "
-        f"map file; got {describe(grid, 320)}"
+        f"map file; got {describe(grid, 320)}{missing}"
     )

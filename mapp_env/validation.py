@@ -30,7 +30,7 @@ _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 300
 
 def describe(value: object, limit: int = 100) -> str:
     """Return ``repr(value)``, cut so that a message stays readable whatever was passed."""
-    if isinstance(value, np.ndarray) and value.size > 16:
+    if isinstance(value, np.ndarray) and (value.ndim > 1 or value.size > 16):
         return f"array of shape {value.shape} and dtype {value.dtype}"
     try:
         text = _SHORT.repr(value)

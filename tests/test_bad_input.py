@@ -143,6 +143,7 @@ def test_more_landmarks_than_cells() -> None:
         ("allow_wait", 1, ["True", "False"]),
         ("allow_wait", None, ["True", "False"]),
         ("grid", "paper-8x8", ["paper-7x7"]),
+        ("grid", "nope.map", ["paper-7x7", "map file", "there is no such file"]),
         ("grid", 7, []),
         ("grid", None, []),
     ],
@@ -496,6 +497,21 @@ def test_batched_landmarks(landmarks: np.ndarray, same: Any) -> None:
     same(venv.step(np.array(GOOD_BATCH)), twin.step(np.array(GOOD_BATCH)))
 
 
+@pytest.mark.parametrize("shape", [(3, 5), (2, 4), (2, 5, 1), (1000, 5), (0, 5), (6,)], ids=repr)
+@pytest.mark.parametrize("face", FACES)
+def test_landmarks_of_a_wrong_shape(face: str, shape: tuple[int, ...]) -> None:
+    """The message is one short line that says which shape was given, and what was wanted."""
+    landmarks = np.ones(shape, int)
+    with pytest.raises(ValueError, match=r"^options\['landmarks'\]") as caught:
+        FACES[face]().reset(options={"landmarks": landmarks})
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 140
+    if len(shape) > 1:
+        assert f"shape {shape}" in message
+        assert ("(2, 5)" if face == "vector" else "5 cells") in message
+
+
 @pytest.mark.parametrize(
     "mask",
     [[True], np.array([True]), np.array([1, 0]), np.array([False, False]), "yes",
@@ -611,6 +627,16 @@ BAD_TEXTS: dict[str, tuple[str, str]] = {
     "header without map": ("type octile\nheight 2\nwidth 3\n", ""),
     "header without width": ("type octile\nheight 2\nmap\n...\n...\n", "width"),
     "header twice": ("type octile\nheight 2\nheight 2\nwidth 3\nmap\n...\n...\n", "height"),
+    "blank first column": (" ..\n D.\n", ":1: column 1 is ' '"),
+    "blank last column": (".. \nD. \n", ":1: column 3 is ' '"),
+    "tabs in the last column": ("..\t\nD.\t", ":1: column 3 is '\\t'"),
+    "blank first row": ("  \n..\nD.\n", ":1: column 1 is ' '"),
+    "blank last row": ("..\nD.\n  ", ":3: column 1 is ' '"),
+    "blank rows alone": ("  \n  \n", ":1: column 1 is ' '"),
+    "blank rows below a header": (
+        "type octile\nheight 2\nwidth 3\nmap\n   \n   \n",
+        ":5: column 1 is ' '",
+    ),
     "rows after the end": ("type octile\nheight 1\nwidth 3\nmap\n...\n...\n", ""),
 }
 
@@ -634,6 +660,56 @@ def test_malformed_maps(case: str, tmp_path: Path) -> None:
         if case in ("ragged", "unknown letter", "two depots", "inner blank line"):
             assert re.search(rf":{hint}:|\bline {hint}\b", str(caught.value))
         assert len(str(caught.value)) < 600
+
+
+READ_TEXTS: dict[str, str] = {
+    "as it is": "..#\nD..",
+    "line break at the end": "..#\nD..\n",
+    "empty lines at both ends": "\n\n..#\nD..\n\n\n",
+    "line breaks of Windows": "..#\r\nD..\r\n",
+    "line breaks of old": "..#\rD..",
+    "byte order mark": "\ufeff..#\nD..\n",
+    "byte order mark before a header": "\ufefftype octile\nheight 2\nwidth 3\nmap\n..#\nD..\n",
+    "blanks after a row": "..#  \nD..\n",
+    "a tab after a row": "..#\nD..\t",
+    "header in another order": "type tile\nwidth 3\nheight 2\nmap\n..@\nDGG",
+}
+
+
+@pytest.mark.parametrize("case", READ_TEXTS)
+def test_maps_that_are_read(case: str, tmp_path: Path) -> None:
+    """What editors leave in a text is no fault, given as a string or in a file."""
+    grid = mapp_env.Grid([[False, False, True], [False] * 3], depot=3)
+    assert mapp_env.Grid.from_text(READ_TEXTS[case]) == grid
+    (tmp_path / "a.map").write_bytes(READ_TEXTS[case].encode("utf-8"))
+    assert mapp_env.Grid.load(tmp_path / "a.map") == grid
+
+
+def test_a_text_is_indented_like_the_code_around_it(tmp_path: Path) -> None:
+    """A string that starts with a line break may be indented; a file, and other strings, not."""
+    text = """
+        ..#
+        D..
+    """
+    assert mapp_env.Grid.from_text(text).to_text() == "..#\nD.."
+    (tmp_path / "a.map").write_text(text)
+    for call in (
+        lambda: mapp_env.Grid.load(tmp_path / "a.map"),
+        lambda: mapp_env.Grid.from_text(text[1:]),
+        lambda: mapp_env.Grid.from_text("\n  ..#\n D..\n"),
+    ):
+        with pytest.raises(ValueError, match=r":[12]: column 1 is ' '"):
+            call()
+
+
+@pytest.mark.parametrize(("encoding", "named"), [
+    ("utf-16", "UTF-16's byte order mark"), ("latin-1", "the byte 0xe9"),
+])  # fmt: skip
+def test_other_encodings_are_named(encoding: str, named: str, tmp_path: Path) -> None:
+    """A map file in another encoding is refused, and the message says why."""
+    (tmp_path / "a.map").write_bytes("D.\xe9".encode(encoding))
+    with pytest.raises(mapp_env.MapError, match=rf"a\.map:1: holds {named}"):
+        mapp_env.Grid.load(tmp_path / "a.map")
 
 
 @pytest.mark.parametrize("value", [None, 5, b"D..\n", ["D.."]], ids=repr)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import importlib.util
+import json
 import pickle
 import subprocess
 import sys
@@ -192,6 +194,32 @@ def test_ids_are_known_where_only_gymnasium_is_imported() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["(1,", "13)", "mapp_env/Central-v0", "mapp_env/Tuple-v0"]
+
+
+def spec_through_json(spec: Any) -> Any:
+    """Return a spec written as JSON and read again."""
+    return type(spec).from_json(spec.to_json())
+
+
+def test_specs_with_a_grid_are_json() -> None:
+    """Made anew from its spec's JSON text, an environment on a grid of one's own has that grid."""
+    grid = mapp_env.Grid.from_text("..#\n...\n.#.", depot=5)
+    arguments: dict[str, Any] = {"grid": grid, "n_agents": 2, "n_landmarks": 3}
+    for name in ("mapp_env/Central-v0", "mapp_env/Tuple-v0"):
+        env = gymnasium.make(name, **arguments)
+        twin = gymnasium.make(spec_through_json(env.spec))
+        assert twin.unwrapped.task == env.unwrapped.task
+    for mode in (None, "sync"):
+        envs = gymnasium.make_vec("mapp_env/Central-v0", 2, vectorization_mode=mode, **arguments)
+        twins = gymnasium.make_vec(spec_through_json(envs.spec))
+        one = twins if mode is None else twins.envs[0].unwrapped
+        assert (one.task.grid, one.task.n_agents, twins.num_envs) == (grid, 2, 2)
+    fields = json.loads(json.dumps(dataclasses.asdict(mapp_env.Problem(grid, (0, 8)))))
+    assert fields["grid"] == {"text": "..#\n..D\n.#."}
+    assert mapp_v0.parallel_env(grid=fields["grid"], n_landmarks=3).task.grid == grid
+    for wrong in ({}, {"text": "x"}, {"text": 3}, {"text": "D.", "depot": 1}):
+        with pytest.raises(ValueError, match="grid"):
+            mapp_v0.parallel_env(grid=wrong)
 
 
 def test_seven_agents_have_a_multidiscrete_action() -> None:
