@@ -5,6 +5,9 @@ from numbers import Integral, Real
 
 import numpy as np
 
+from mapp_env import Grid
+from mapp_env.grid import tell_apart
+
 
 def check_count(name: str, value: object, low: int, high: int) -> None:
     """Refuse what is not a whole number in ``[low, high]``.
@@ -54,6 +57,21 @@ def check_flag(name: str, value: object) -> None:
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be True or False, got {value!r}")
+
+
+def check_grid(policy: object, grid: Grid) -> None:
+    """Refuse a policy that was trained on another grid; one that names none plays on any.
+
+    Raises
+    ------
+    ValueError
+        If its grid is another, or it is not known which one it is.
+    """
+    own = getattr(policy, "grid", None)
+    if isinstance(own, Grid) and own != grid:
+        raise ValueError(
+            f"policy must be one of this grid, got one of another; here {tell_apart(grid, own)}"
+        )
 
 
 def check_rows(observations: object) -> np.ndarray:

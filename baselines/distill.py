@@ -25,7 +25,7 @@ import tyro
 from torch import Tensor
 
 from baselines.checkpoints import part
-from baselines.checks import check_count, check_number
+from baselines.checks import check_count, check_grid, check_number
 from baselines.exact_values import steps_left
 from baselines.imagined_replay import ImaginedReplay
 from baselines.imitation import (
@@ -173,8 +173,11 @@ def main(args: Args) -> int:
     else:
         setting, _ = read_setting(args.resume)
     policy = args.policy and start_of(args.resume, args.policy)
-    start = load_policy(policy).network if policy else None
-    grid = setting.grid
+    grid, start = setting.grid, None
+    if policy:
+        loaded = load_policy(policy)
+        check_grid(loaded, grid)
+        start = loaded.network
     return run_imitation(args, ALGORITHM, setting, lambda: Distilled(args, grid, start), [])
 
 

@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checks import check_count
+from baselines.checks import check_count, check_grid
 from baselines.guidance import Acting
 from baselines.settings import Setting
 from mapp_env import Problem, make_vec, sample_problems, solve
@@ -193,9 +193,10 @@ def evaluate(
     Raises
     ------
     ValueError
-        If there is no problem, or one is not a problem of the grid.
+        If there is no problem, one is not a problem of the grid, or the policy is of another grid.
     """
     check_count("n_kept", n_kept, 0, 1_000_000)
+    check_grid(policy, setting.grid)
     landmarks = np.asarray(landmarks)
     if landmarks.ndim != 2 or landmarks.shape[0] == 0 or landmarks.shape[1] != setting.n_landmarks:
         raise ValueError(

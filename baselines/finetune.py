@@ -32,7 +32,7 @@ from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
-from baselines.checks import check_count, check_number
+from baselines.checks import check_count, check_grid, check_number
 from baselines.evaluation import (
     MAX_EXACT_LANDMARKS,
     count_unseen,
@@ -179,7 +179,13 @@ def finetune(
     """Return the best plan of the episodes played, and how many they were.
 
     It ends early when nothing has become better for a while.
+
+    Raises
+    ------
+    ValueError
+        If the policy is of another grid than the problem, or of too large a team.
     """
+    check_grid(policy, problem.grid)
     tuner = Tuner(args, policy.network, problem)
     env = mapp_v0.parallel_env(
         setting.grid, setting.n_agents, setting.n_landmarks, setting.max_cycles

@@ -14,7 +14,7 @@ from typing import Protocol
 
 import numpy as np
 
-from baselines.checks import check_count, check_number, check_observations
+from baselines.checks import check_count, check_grid, check_number, check_observations
 from mapp_env import Grid
 
 NO_DIRECTION = -1
@@ -48,7 +48,8 @@ class Guidance:
 
     def __init__(self, grid: Grid, n_agents: int, n_landmarks: int, reach: int) -> None:
         check_count("reach", reach, 1, 512)
-        self.n_agents, self.n_landmarks, self.reach = n_agents, n_landmarks, reach
+        self.grid, self.reach = grid, reach
+        self.n_agents, self.n_landmarks = n_agents, n_landmarks
         self.rays = sight_rays(grid, reach)
 
     def directions(self, observations: np.ndarray) -> np.ndarray:
@@ -86,6 +87,8 @@ class GuidedPolicy:
         self, policy: Acting, guidance: Guidance, influence: float, rng: np.random.Generator
     ) -> None:
         check_number("influence", influence, 0.0, 1.0)
+        check_grid(policy, guidance.grid)
+        self.grid = guidance.grid
         self.policy, self.guidance, self.influence, self.rng = policy, guidance, influence, rng
 
     def act(self, observations: np.ndarray) -> np.ndarray:

@@ -16,7 +16,8 @@ import torch
 
 from baselines.checks import check_count, check_observations, check_rows
 from baselines.networks import Network, NetworkSpec, build_network, greedy_actions
-from baselines.runs import WEIGHTS_FILE, parse_json
+from baselines.runs import CONFIG_FILE, WEIGHTS_FILE, parse_json
+from baselines.settings import read_grid
 from mapp_env import Grid
 from mapp_env.files import read_bytes, write_bytes
 
@@ -25,16 +26,40 @@ WEIGHTS_VERSION = 1
 # The largest network that NetworkSpec allows takes 74 MiB.
 MAX_WEIGHTS_BYTES = 80 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024
+ZIP = b"PK\x03\x04"  # how such a file begins
 PRETRAINED = Path(__file__).parent / "pretrained"  # a folder for each name, like a run's
 MAX_TABLE_CELLS = 4096  # the most cells for which a Grid keeps the distances of all pairs
 
 
 class NetworkPolicy:
-    """Greedy commands of a network: the joint action, or each agent's, of the highest value."""
+    """Greedy commands of a network: the joint action, or each agent's, of the highest value.
 
-    def __init__(self, network: Network) -> None:
+    Parameters
+    ----------
+    network
+        Gives the values.
+    grid
+        The grid it was trained on, or an error that says why that is not known; by default the
+        policy plays on any.
+    """
+
+    def __init__(self, network: Network, grid: Grid | ValueError | None = None) -> None:
         self.network = network
         self.spec = network.spec
+        self._grid = grid
+
+    @property
+    def grid(self) -> Grid | None:
+        """The grid it was trained on; None if it plays on any.
+
+        Raises
+        ------
+        ValueError
+            If that is not known.
+        """
+        if isinstance(self._grid, ValueError):
+            raise ValueError(str(self._grid))
+        return self._grid
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Return greedy joint actions (B, N) int64: no guidance, no search.
@@ -80,7 +105,7 @@ class NearestLandmarkPolicy:
     def __init__(self, grid: Grid, n_agents: int, n_landmarks: int) -> None:
         # The table of first moves has one entry per pair of cells.
         check_count("n_cells", grid.n_cells, 2, MAX_TABLE_CELLS)
-        self.n_agents, self.n_landmarks = n_agents, n_landmarks
+        self.grid, self.n_agents, self.n_landmarks = grid, n_agents, n_landmarks
         distances = np.asarray(grid.distances)  # (C, C), -1 unreachable
         self.distances = np.where(distances < 0, np.iinfo(np.int32).max, distances)
         after = self.distances[np.asarray(grid.moves)]  # (C, 4, C)
@@ -132,7 +157,9 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
     Returns
     -------
     NetworkPolicy
-        Acts greedily: ``.act(observations (B, N + 2K)) -> actions (B, N)``.
+        Acts greedily: ``.act(observations (B, N + 2K)) -> actions (B, N)``, on ``.grid``, which
+        the config.json beside the weights names; without one the policy acts, but is refused
+        where a grid is known.
 
     Raises
     ------
@@ -167,7 +194,21 @@ def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
         if not torch.isfinite(found).all():
             raise ValueError(f"{file}: {name}: holds NaN or infinite weights")
     network.load_state_dict(weights)
-    return NetworkPolicy(network.eval())
+    return NetworkPolicy(network.eval(), find_grid(file, spec))
+
+
+def find_grid(file: Path, spec: NetworkSpec) -> Grid | ValueError:
+    """Return the grid that weights were trained on, or why it is not known."""
+    try:
+        grid = read_grid(file.parent)
+        if grid.n_cells != spec.n_cells:
+            raise ValueError(f"its grid has {grid.n_cells} cells, the weights have {spec.n_cells}")
+    except ValueError as error:
+        return ValueError(
+            f"{file}: the grid that these weights were trained on is not known: put the "
+            f"{CONFIG_FILE} of their run beside them ({error})"
+        )
+    return grid
 
 
 def pretrained_names() -> list[str]:
@@ -208,6 +249,11 @@ def read_spec(file: Path, content: bytes) -> NetworkSpec:
     ValueError
         If the header is damaged, has an entry twice, or is not one of ours.
     """
+    if content.startswith(ZIP):
+        raise ValueError(
+            f"{file}: foreign weights: this is a zip file, as Stable-Baselines3 and torch.save "
+            "write; a policy must be a safetensors file that a training of the baselines wrote"
+        )
     length = struct.unpack("<Q", content[:8])[0] if len(content) >= 8 else 0
     if not 2 <= length <= min(MAX_HEADER_BYTES, len(content) - 8):
         raise ValueError(f"{file}: damaged weights: this is not a safetensors file")

@@ -26,6 +26,23 @@ def find_grid(name: str) -> Grid:
     return make_grid(name) if name in grid_names() else Grid.load(name)
 
 
+def read_grid(folder: Path) -> Grid:
+    """Read from a run folder which grid was trained on.
+
+    Raises
+    ------
+    ValueError
+        If the run's config does not say it.
+    """
+    config = read_config(folder)
+    try:
+        return Grid.from_text(config["grid"])
+    except KeyError as error:
+        raise ValueError(f"{folder / CONFIG_FILE}: no entry {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{folder / CONFIG_FILE}: grid: {error}") from error
+
+
 def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
     """Read from a run folder what was trained: the setting, and the training problems.
 

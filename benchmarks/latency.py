@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from baselines.checks import check_grid
 from baselines.evaluation import Optima, evaluate, find_optima
 from baselines.guidance import Acting
 from baselines.policy import NearestLandmarkPolicy, NetworkPolicy, load_policy, pretrained_names
@@ -116,8 +117,11 @@ def load_fitting(name: str) -> NetworkPolicy:
         If there is none, or it is for another.
     """
     policy = load_policy(name)
+    try:
+        check_grid(policy, SETTING.grid)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     for what, wanted in (
-        ("n_cells", SETTING.grid.n_cells),
         ("n_agents", SETTING.n_agents),
         ("n_landmarks", SETTING.n_landmarks),
     ):

@@ -44,7 +44,7 @@ from baselines.experiment import training_problems
 from baselines.meta_dqn import Args as Options
 from baselines.meta_dqn import MetaLearner
 from baselines.options import preset_options
-from baselines.policy import load_policy, save_policy
+from baselines.policy import NetworkPolicy, load_policy, save_policy
 from baselines.runs import WEIGHTS_FILE
 from baselines.settings import Setting, find_grid
 from baselines.training import Streams, Training
@@ -225,7 +225,8 @@ def final_figures(args: Args, result: "tune.Result") -> str:
     setting = Setting(grid, options.n_agents, options.n_landmarks, options.max_cycles)
     _, final = held_out(setting, args.problems, training_problems(options, grid))
     with result.checkpoint.as_directory() as folder:
-        policy = load_policy(Path(folder) / WEIGHTS_FILE)
+        network = load_policy(Path(folder) / WEIGHTS_FILE).network
+    policy = NetworkPolicy(network, grid)  # a trial keeps weights alone, not which grid they are of
     found = evaluate(policy, setting, final, find_optima(setting, final)).summary()
     return ", ".join(f"{name} {found[name]:.2f}" for name in ("solved %", "gap %", "optimal %"))
 

@@ -374,6 +374,19 @@ def trace_path(moves: NDArray[np.int32], steps: NDArray[np.int32], path: NDArray
                 break
 
 
+def tell_apart(grid: Grid, other: Grid) -> str:
+    """Return in words what makes a grid another than one that does not equal it."""
+    if grid.walls.shape != other.walls.shape:
+        return f"{grid.rows} x {grid.cols} cells, not {other.rows} x {other.cols}"
+    if grid.depot != other.depot:
+        return f"the depot is cell {grid.depot}, not {other.depot}"
+    cells = np.flatnonzero(grid.walls != other.walls)
+    words = ("free", "a wall")
+    first = bool(grid.walls.flat[cells[0]])
+    more = f", and {len(cells) - 1} more differ" if len(cells) > 1 else ""
+    return f"cell {cells[0]} is {words[first]}, not {words[not first]}{more}"
+
+
 def _frozen(array: NDArray[np.int32]) -> NDArray[np.int32]:
     array.flags.writeable = False
     return array

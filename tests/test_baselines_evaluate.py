@@ -18,7 +18,15 @@ from baselines.evaluation import (
     save_table,
     unseen_problems,
 )
-from baselines.policy import NearestLandmarkPolicy, RandomPolicy
+from baselines.guidance import Guidance, GuidedPolicy
+from baselines.networks import NetworkSpec, build_network
+from baselines.policy import (
+    NearestLandmarkPolicy,
+    NetworkPolicy,
+    RandomPolicy,
+    load_policy,
+    save_policy,
+)
 from mapp_env import Grid, Problem, make_grid, replay, solve
 
 PAPER = Setting(make_grid("paper-7x7"))
@@ -90,6 +98,52 @@ def test_problems_that_do_not_fit_are_refused():
     for shape in ((0, 5), (3, 4), (5,)):
         with pytest.raises(ValueError, match="landmarks must be cells of shape"):
             evaluate(nearest, PAPER, np.zeros(shape, int))
+
+
+def grids_of_49_cells():
+    """Return the paper's grid with other walls, with another depot, and of another shape."""
+    text = PAPER.grid.to_text()
+    yield Grid.from_text(text.replace("...#...", "..#...."))
+    yield Grid(PAPER.grid.walls, depot=0)
+    yield Grid.from_text("D" + "." * 48)
+
+
+def test_a_policy_plays_on_its_own_grid_alone(tmp_path):
+    """Same size, another wall or depot: refused, guided too; an equal grid, or none named, plays.
+
+    A network whose weights do not say which grid they are of is refused on any.
+    """
+    spec = NetworkSpec("paper", 3, 5, 4, 49, 8)
+    network = build_network(spec)
+    guidance = Guidance(PAPER.grid, 3, 5, 3)
+    rng = np.random.default_rng(0)
+    own = NetworkPolicy(network, Grid.from_text(PAPER.grid.to_text()))
+    policies = [own, rivals(PAPER)[1], GuidedPolicy(own, guidance, 0.5, rng)]
+    policies.append(GuidedPolicy(rivals(PAPER)[0], guidance, 0.5, rng))
+    save_policy(tmp_path / "w", network)
+    unknown = load_policy(tmp_path / "w")
+    problems = unseen_problems(PAPER, 3)
+    for policy in (*policies, NetworkPolicy(network)):
+        assert len(evaluate(policy, PAPER, problems).steps) == 3
+    with pytest.raises(ValueError, match="not known: put the config"):
+        evaluate(unknown, PAPER, problems)
+    for grid, said in zip(
+        grids_of_49_cells(),
+        (
+            "cell 44 is a wall, not free, and 1 more differ",
+            "the depot is cell 0, not 24",
+            "1 x 49 cells, not 7 x 7",
+        ),
+        strict=True,
+    ):
+        other = Setting(grid)
+        problems = unseen_problems(other, 3)
+        for policy in policies:
+            with pytest.raises(ValueError, match=f"^policy must be one of this grid, .*{said}$"):
+                evaluate(policy, other, problems)
+        assert len(evaluate(NetworkPolicy(network), other, problems).steps) == 3
+        with pytest.raises(ValueError, match="policy must be one of this grid"):
+            GuidedPolicy(own, Guidance(grid, 3, 5, 3), 0.5, rng)
 
 
 def test_table_says_when_nothing_was_solved(tmp_path):

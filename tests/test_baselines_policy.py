@@ -19,7 +19,7 @@ from baselines.policy import (
     load_policy,
     save_policy,
 )
-from mapp_env import make_grid
+from mapp_env import Grid, make_grid
 
 SPEC = NetworkSpec("paper", 3, 5, 4, 49, 16)
 ABOUT = json.dumps({"version": 1, **SPEC.as_dict()})
@@ -161,6 +161,42 @@ def test_damaged_files_are_refused(tmp_path, network):
     path.write_bytes(b"\x80\x04\x95 a pickle is refused too" * 10)
     with pytest.raises(ValueError, match="not a safetensors"):
         load_policy(path)
+
+
+def test_a_zip_is_called_a_zip(tmp_path, network):
+    """What other trainers save is named for what it is, and so is what a policy must be."""
+    torch.save(network.state_dict(), tmp_path / "model.zip")
+    with pytest.raises(ValueError, match=r"model\.zip: .*a zip file.*must be a safetensors file"):
+        load_policy(tmp_path / "model.zip")
+
+
+def test_a_policy_has_the_grid_that_its_config_names(tmp_path, network):
+    """By name, by folder and by file; without one that can be read, asking for it says why."""
+    for name in ("pretrained", "pretrained-distilled"):
+        assert load_policy(name).grid == make_grid()
+    save_policy(tmp_path / "policy.safetensors", network)
+    grid = Grid.from_text("\n".join(["D......"] + ["......."] * 6))
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"grid": grid.to_text()}))
+    for path in (tmp_path, tmp_path / "policy.safetensors"):
+        assert load_policy(path).grid == grid
+    for text, reason in (
+        ("{", "not a readable config"),
+        ("{}", "no entry 'grid'"),
+        ('{"grid": "x"}', "grid: text:1"),
+        ('{"grid": 7}', "grid: text must be a str"),
+        ('{"grid": "D.."}', "its grid has 3 cells, the weights have 49"),
+        (None, "not a regular file"),
+    ):
+        if text is None:
+            config.unlink()
+        else:
+            config.write_text(text)
+        policy = load_policy(tmp_path)
+        assert policy.act(observations(2)).shape == (2, 3)
+        with pytest.raises(ValueError, match=rf"not known: put the config\.json .*{reason}"):
+            policy.grid  # noqa: B018
+    assert NetworkPolicy(network).grid is None
 
 
 def test_missing_and_irregular_files_are_refused(tmp_path):

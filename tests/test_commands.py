@@ -330,6 +330,29 @@ def test_the_pretrained_policy_plays(folder: Path, capsys: pytest.CaptureFixture
     assert found["cover_time"] >= mapp_env.solve(PROBLEM).cost
 
 
+def test_a_policy_of_another_grid_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, loader: str
+) -> None:
+    """One moved wall is another grid, an equal map file is not; what names no grid plays on any."""
+    text = mapp_env.make_grid().to_text()
+    (folder / "same.txt").write_text(text.replace("#", "@"), encoding="ascii")
+    (folder / "other.txt").write_text(text.replace("...#...", "..#...."), encoding="ascii")
+    options = ["render", "--out", "a.gif", "--landmarks", *CELLS, "--grid"]
+    record(capsys, *options, "same.txt", "--policy", "pretrained")
+    assert main([*options, "other.txt", "--policy", "pretrained"]) == 2
+    assert re.fullmatch(
+        "error: --policy .* another grid; here cell 44 is a wall, not free, and 1 more differ\n",
+        capsys.readouterr().err,
+    )
+    walker = ["--policy", "3", "--policy-loader", loader, "--max-cycles", "2"]
+    for grid in (None, "any", np.zeros(3)):
+        monkeypatch.setattr(Walker, "grid", grid, raising=False)
+        record(capsys, *options, "other.txt", *walker)
+    monkeypatch.setattr(Walker, "grid", property(lambda walker: 1 // 0))
+    assert main([*options, "other.txt", *walker]) == 2
+    assert "--policy cannot play this problem: ZeroDivisionError" in capsys.readouterr().err
+
+
 # -- refusals ----------------------------------------------------------------------------------
 
 

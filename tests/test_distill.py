@@ -211,12 +211,19 @@ def test_what_is_wrong_with_a_checkpoint_is_said(tmp_path, monkeypatch, forge):
 
 
 def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
-    """With its weights, to the bit, even if it is gone later; another network is refused."""
+    """With its weights, to the bit, even if it is gone later.
+
+    Another network is refused, and so is the same one of another grid.
+    """
     first, options = tmp_path / "first", {**SMALL, "updates": 10}
     assert distill.main(distill.Args(out=first, **options, half_precision=False)) == 0
     start = load_policy(first).network.state_dict()
     with pytest.raises(ValueError, match="policy must have the network"):
         distill.main(distill.Args(policy=str(first), **{**options, "hidden_units": 33}))
+    (tmp_path / "other.txt").write_text(make_grid().to_text().replace("...#...", "..#...."))
+    other = {**options, "grid": str(tmp_path / "other.txt"), "policy": str(first)}
+    with pytest.raises(ValueError, match="policy must be one of this grid"):
+        distill.main(distill.Args(**other))
     further = {**options, "policy": str(first), "seed": 1}
     assert distill.main(distill.Args(out=tmp_path / "whole", **further)) == 0
 

@@ -134,6 +134,15 @@ def test_what_cannot_be_fine_tuned_is_refused(folder):
         finetune.finetune(finetune.Args(landmarks=CELLS), large, Setting(GRID, 7, 2, 20), problem)
 
 
+def test_a_policy_of_another_grid_is_not_fine_tuned():
+    """As many cells, one wall moved: refused before anything is played."""
+    other = make_grid("random", rows=5, cols=5, seed=2, density=0.1)
+    policy = NetworkPolicy(untrained().network, other)
+    problem = solve.make_problem(SETTING, CELLS)
+    with pytest.raises(ValueError, match="policy must be one of this grid, got one of another"):
+        finetune.finetune(finetune.Args(landmarks=CELLS), policy, SETTING, problem)
+
+
 def test_imagined_episodes_are_made_of_experienced_moves():
     """What is imagined would happen: replayed by the rules it covers all in as many steps.
 

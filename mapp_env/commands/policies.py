@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.central_env import CentralEnv
+from mapp_env.grid import Grid, tell_apart
 from mapp_env.plan import Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
@@ -28,7 +29,7 @@ DEFAULT_LOADER = "baselines.policy:load_policy"
 
 
 class Policy(Protocol):
-    """What a loader returns."""
+    """What a loader returns; with a ``grid`` if it was trained on just one."""
 
     def act(self, observations: NDArray[np.float32], /) -> Any:
         """Return actions (B, N) for global observations (B, N + 2K)."""
@@ -103,8 +104,10 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     Raises
     ------
     ValueError
-        If the policy cannot play such a problem, or its actions are none.
+        If the policy was trained on another grid, cannot play such a problem, or its actions are
+        none.
     """
+    _check_grid(policy, problem.grid)
     env = CentralEnv(
         problem.grid,
         problem.n_agents,
@@ -119,6 +122,20 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
         observation, _, terminated, truncated, _ = env.step(actions[-1])
         over = terminated or truncated
     return replay(replace(problem, max_cycles=max_cycles), np.array(actions))
+
+
+def _check_grid(policy: Policy, grid: Grid) -> None:
+    """Refuse a policy of another grid; one that names none plays on any."""
+    try:
+        own = getattr(policy, "grid", None)
+    except Exception as error:  # whatever it is, it is the policy's, not ours
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise ValueError(f"--policy cannot play this problem: {reason}") from error
+    if isinstance(own, Grid) and own != grid:
+        raise ValueError(
+            "--policy cannot play this problem: it was trained on another grid; here "
+            f"{tell_apart(grid, own)}"
+        )
 
 
 def _act(policy: Policy, observation: NDArray[np.float32], n_agents: int) -> NDArray[np.int64]:
