@@ -56,8 +56,8 @@ class Args:
     )
     """learners to compare: one network commands all agents, each agent has its own, or all use one
     by themselves"""
-    default_updates: int = 32
-    """updates after each episode under the preset default; 32 are its own"""
+    default_updates: int | None = None
+    """updates after each episode under the preset default (32, its own)"""
     seeds: int = 5
     """trainings of each: seeds 0, 1, 2 ..."""
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -68,7 +68,12 @@ class Args:
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise ValueError(f"{name} must be one or more, none twice, got {values!r}")
-        check_count("default_updates", self.default_updates, 1, 1_000_000)
+        if self.default_updates is not None:
+            check_count("default_updates", self.default_updates, 1, 1_000_000)
+            if "default" not in self.presets:
+                raise ValueError(
+                    f"default_updates has no effect with presets {self.presets!r}: leave it out"
+                )
         check_count("seeds", self.seeds, 1, 10_000)
         check_count("jobs", self.jobs, 1, 1024)
 
@@ -88,7 +93,7 @@ def plan_trials(args: Args, words: Sequence[str]) -> list[Trial]:
                 algorithm, kind, own = LEARNERS[learner]
                 own = ("--preset", preset, *own)
                 if preset == "default":
-                    own += ("--updates-per-episode", str(args.default_updates))
+                    own += ("--updates-per-episode", str(args.default_updates or 32))
                 group = (preset, learner)
                 trials.append(plan_trial(group, seed, args.out, (algorithm, kind), own, words))
     return trials

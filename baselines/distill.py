@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from baselines.checkpoints import part
@@ -33,6 +32,7 @@ from baselines.imitation import (
     Pupil,
     good_actions_loss,
     own_options,
+    parse_arguments,
     run_imitation,
     start_of,
 )
@@ -183,6 +183,6 @@ def main(args: Args) -> int:
 
 if __name__ == "__main__":
     try:
-        sys.exit(main(tyro.cli(Args, description=__doc__)))
+        sys.exit(main(parse_arguments(Args, __doc__ or "")))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error

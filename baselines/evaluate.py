@@ -43,6 +43,9 @@ from baselines.policy import (
 from baselines.settings import N_ACTIONS, Setting, find_grid
 from baselines.trained import load_trained
 
+RIVALS = ("random", "nearest")
+SETTING = ("grid", "n_agents", "n_landmarks", "max_cycles")
+
 
 @dataclass
 class Args:
@@ -58,16 +61,16 @@ class Args:
     """seed of the problems and of everything random in the policy"""
     guidance: float = 0.0
     """probability that an agent with a close unvisited landmark in sight is sent there instead"""
-    guidance_reach: int = 3
-    """how many moves away a landmark is still close"""
-    grid: str = "paper-7x7"
-    """bundled grid or map file, for "random" and "nearest"; a run brings its own"""
-    n_agents: int = 3
-    """number of agents, for "random" and "nearest"; a run brings its own"""
-    n_landmarks: int = 5
-    """number of landmarks, for "random" and "nearest"; a run brings its own"""
-    max_cycles: int = 50
-    """step limit of an episode, for "random" and "nearest"; a run brings its own"""
+    guidance_reach: int | None = None
+    """with guidance: how many moves away a landmark is still close (3)"""
+    grid: str | None = None
+    """bundled grid or map file, for "random" and "nearest" (paper-7x7); a run brings its own"""
+    n_agents: int | None = None
+    """number of agents, for "random" and "nearest" (3); a run brings its own"""
+    n_landmarks: int | None = None
+    """number of landmarks, for "random" and "nearest" (5); a run brings its own"""
+    max_cycles: int | None = None
+    """step limit of an episode, for "random" and "nearest" (50); a run brings its own"""
     out: Path | None = None
     """folder for evaluation.csv and evaluation.md; nothing is written without it"""
     threads: int = 1
@@ -79,6 +82,14 @@ class Args:
         check_count("seed", self.seed, 0, 2**63 - 1)
         check_number("guidance", self.guidance, 0.0, 1.0)
         check_count("threads", self.threads, 1, 1024)
+        if self.guidance == 0 and self.guidance_reach is not None:
+            raise ValueError("guidance_reach has no effect with guidance 0: leave it out")
+        brought = [name for name in SETTING if getattr(self, name) is not None]
+        if brought and self.policy not in RIVALS:
+            raise ValueError(
+                f"{brought[0]} has no effect with policy {self.policy!r}, which brings its own: "
+                "leave it out"
+            )
 
 
 def main(args: Args) -> None:
@@ -93,8 +104,10 @@ def main(args: Args) -> None:
     rng_policy, rng_guidance = np.random.default_rng(args.seed).spawn(2)
     seen: list[tuple[int, ...]] = []
     policy: Acting
-    if args.policy in ("random", "nearest"):
-        setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
+    if args.policy in RIVALS:
+        values = {name: getattr(args, name) for name in SETTING[1:]}
+        said = {name: value for name, value in values.items() if value is not None}
+        setting = Setting(find_grid("paper-7x7" if args.grid is None else args.grid), **said)
         if args.policy == "random":
             policy = RandomPolicy(setting.n_agents, N_ACTIONS, rng_policy)
         else:
@@ -103,9 +116,8 @@ def main(args: Args) -> None:
         policy, setting, seen = load_trained(args.policy)
     label = args.policy
     if args.guidance > 0:
-        guidance = Guidance(
-            setting.grid, setting.n_agents, setting.n_landmarks, args.guidance_reach
-        )
+        reach = 3 if args.guidance_reach is None else args.guidance_reach
+        guidance = Guidance(setting.grid, setting.n_agents, setting.n_landmarks, reach)
         policy = GuidedPolicy(policy, guidance, args.guidance, rng_guidance)
         label += f" + guidance {args.guidance:g}"
     problems = choose_problems(args, setting, seen)

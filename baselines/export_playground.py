@@ -44,10 +44,14 @@ class Args:
 
     policy: str = "pretrained"
     """a pretrained policy's name or a run folder"""
-    out: Path = PLAYGROUND / "weights.js"
-    """the script to write"""
+    out: Path | None = None
+    """the script to write (docs/playground/weights.js)"""
     rounding: bool = False
     """count the episodes that rounding changes, and write nothing"""
+
+    def __post_init__(self) -> None:
+        if self.rounding and self.out is not None:
+            raise ValueError("out has no effect with rounding: leave it out")
 
 
 def export(policy: str) -> str:
@@ -188,8 +192,9 @@ def main(args: Args) -> None:
         )
         return
     script = export(args.policy).encode()
-    write_bytes(args.out, script, MAX_SCRIPT_BYTES)
-    print(f"{args.out}: {len(script) / 1e6:.2f} MB")
+    out = args.out or PLAYGROUND / "weights.js"
+    write_bytes(out, script, MAX_SCRIPT_BYTES)
+    print(f"{out}: {len(script) / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

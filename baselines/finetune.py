@@ -22,7 +22,7 @@ fine-tuned, and it is said of how many the optimum was found.
 import copy
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +51,7 @@ from mapp_env import Plan, Problem, mapp_v0, replay, solve
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
 # at sharpnesses from one end to the other, episode by episode.
 SHARPNESS = (0.1, 16.0)
+LEARNING = ("imagined", "updates_per_episode", "learning_rate", "patience")
 
 
 @dataclass
@@ -83,8 +84,17 @@ class Args(solving.Args):
         check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
         check_count("patience", self.patience, 1, 30)
         check_count("seed", self.seed, 0, 2**63 - 1)
-        if self.problems and (self.landmarks or self.picture or self.plan):
-            raise ValueError("problems takes no landmarks, picture or plan beside it")
+        beside = ("landmarks", "picture", "plan", "animation")
+        for name in beside if self.problems else ():
+            if getattr(self, name):
+                raise ValueError(f"problems takes no {name} beside it")
+        learns = self.episodes > self.random_episodes + 1
+        for field in fields(self) if not learns else ():
+            if field.name in LEARNING and getattr(self, field.name) != field.default:
+                raise ValueError(
+                    f"{field.name} has no effect with episodes {self.episodes} and random_episodes "
+                    f"{self.random_episodes}, which leave nothing to learn from: leave it out"
+                )
 
 
 class Episode(NamedTuple):

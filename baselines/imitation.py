@@ -7,6 +7,7 @@ outputs are read as logits, and the greedy policy takes the largest, as it does 
 """
 
 import signal
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+import tyro
 from torch import Tensor
 from tqdm import tqdm  # type: ignore[import-untyped]
 
@@ -31,6 +33,7 @@ from baselines.evaluation import (
 )
 from baselines.networks import Network
 from baselines.optimiser import optimiser_arrays, restore_optimiser
+from baselines.options import refuse_beside_resume
 from baselines.policy import load_policy, save_policy
 from baselines.runs import (
     TIMING_FILE,
@@ -207,6 +210,19 @@ def good_actions_loss(scores: Tensor, good: Tensor) -> Tensor:
 # -- the run -----------------------------------------------------------------------------------
 
 Chosen = TypeVar("Chosen", bound=ImitationOptions)
+
+
+def parse_arguments(kind: type[Chosen], description: str) -> Chosen:
+    """Read the options from this process's command line.
+
+    Raises
+    ------
+    ValueError
+        If others are given beside ``resume``.
+    """
+    args = tyro.cli(kind, description=description)
+    refuse_beside_resume(args.resume, sys.argv[1:])
+    return args
 
 
 def own_options(args: Chosen, algorithm: str) -> Chosen:

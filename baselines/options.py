@@ -247,6 +247,48 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
 }
 
+
+def without_effect(options: Options) -> dict[str, str]:
+    """Return the options that the choice of another leaves without effect, and that choice."""
+    o = options
+    final = ("final_reward", "final_discount", "final_reward_scale")
+    choices = (
+        ("network", o.network == "paper", ("code_units", "landmark_units", "route_units")),
+        ("replay", o.replay == "stored", ("action_gap", "final_from", *final)),
+        (
+            "replay",
+            o.replay != "imagined",
+            ("tried_actions", "temperature", *(n for n in vars(o) if n.startswith("imagined_"))),
+        ),
+        ("replay", o.replay != "relabelled", ("fresh_as_far",)),
+        ("replay", o.replay == "stored", ("fresh_landmarks",)),
+        # Independent learners keep what they have seen of the others.
+        ("replay", o.replay == "imagined" and "relabelled" not in o.REPLAYS, ("memory_size",)),
+        ("tried_actions", o.tried_actions == 1, ("temperature", "imagined_exploration")),
+        ("final_reward", o.final_reward == "same", ("final_from", *final[1:])),
+        (
+            "final_from",
+            o.replay != "stored" and o.final_reward != "same" and o.final_from == 0.0,
+            ("discount", "reward_scale"),
+        ),
+        ("final_from", o.final_from == 1.0, final),
+        ("target_interval", o.target_interval > 0, ("target_rate",)),
+        ("epsilon_start epsilon_end", o.epsilon_start == o.epsilon_end, ("epsilon_steps",)),
+        ("guidance_start guidance_end", o.guidance_start == o.guidance_end, ("guidance_fraction",)),
+        (
+            "guidance_start guidance_end",
+            o.guidance_start == o.guidance_end == 0.0,
+            ("guidance_reach",),
+        ),
+    )
+    return {
+        name: " and ".join(f"{choice} {getattr(o, choice)!r}" for choice in makes_idle.split())
+        for makes_idle, chosen, names in choices
+        if chosen
+        for name in names
+    }
+
+
 Chosen = TypeVar("Chosen", bound=Options)
 
 
@@ -269,6 +311,11 @@ def parse_options(
         Shown with the help.
     words
         The command line, by default that of this process.
+
+    Raises
+    ------
+    ValueError
+        If an option is given that another leaves without effect.
     """
     words = sys.argv[1:] if words is None else words
     preset = "default"
@@ -278,7 +325,36 @@ def parse_options(
         elif word == "--preset" and index < len(words):
             preset = words[index]
     start = preset_options(kind, preset if preset in PRESETS else "default")
-    return tyro.cli(kind, args=words, default=start, description=description)
+    options = tyro.cli(kind, args=words, default=start, description=description)
+    refuse_beside_resume(options.resume, words)
+    idle = without_effect(options)
+    for name in given(words):
+        if name in idle:
+            raise ValueError(f"{name} has no effect with {idle[name]}: leave it out")
+    return options
+
+
+def given(words: Sequence[str]) -> list[str]:
+    """Return the names of the options that a command line sets, in its order."""
+    return [option_name(word) for word in words if word.startswith("--")]
+
+
+def option_name(word: str) -> str:
+    """Return the name of the option that a word of a command line sets."""
+    return word.partition("=")[0].removeprefix("--").replace("-", "_").removeprefix("no_")
+
+
+def refuse_beside_resume(resume: Path | None, words: Sequence[str]) -> None:
+    """Refuse other options beside ``resume`` on a command line, even if they are the run's own.
+
+    Raises
+    ------
+    ValueError
+        If there is one.
+    """
+    others = [name for name in given(words) if name != "resume"]
+    if resume is not None and others:
+        raise ValueError(f"resume goes on with the run's own options: leave out {others[0]}")
 
 
 def check_resumed(options: Options) -> None:

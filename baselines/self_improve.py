@@ -28,7 +28,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import Tensor
 
 from baselines.checks import check_count, check_number
@@ -38,6 +37,7 @@ from baselines.imitation import (
     Pupil,
     good_actions_loss,
     own_options,
+    parse_arguments,
     run_imitation,
     start_of,
     starting_point,
@@ -292,6 +292,6 @@ def main(args: Args) -> int:
 
 if __name__ == "__main__":
     try:
-        sys.exit(main(tyro.cli(Args, description=__doc__)))
+        sys.exit(main(parse_arguments(Args, __doc__ or "")))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error

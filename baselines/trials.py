@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from filelock import FileLock, Timeout
 
-from baselines.options import Options, parse_options
+from baselines.options import Options, option_name, parse_options
 from baselines.runs import CONFIG_FILE, LOCK_FILE, foreign_entry, read_config
 
 EVALUATION_FILE = "evaluation.csv"  # a training writes it when it is through
@@ -95,11 +95,6 @@ def plan_trial(
     trial = Trial(group, seed, out / name, kind[0], options, all_words)
     check_folder(trial)
     return trial
-
-
-def option_name(word: str) -> str:
-    """Return the name of the option that a word of a command line sets."""
-    return word.partition("=")[0].removeprefix("--").replace("-", "_").removeprefix("no_")
 
 
 def check_folder(trial: Trial) -> None:

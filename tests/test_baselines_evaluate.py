@@ -336,3 +336,23 @@ def test_problems_out_of_reach_are_said(capsys):
     assert said in capsys.readouterr().out
     script.main(script.Args(**asked))
     assert "out of reach" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"grid": "paper-7x7"}, "grid has no effect with policy 'pretrained'"),
+        ({"n_agents": 3}, "n_agents has no effect with policy 'pretrained'"),
+        ({"n_landmarks": 4}, "n_landmarks has no effect with policy 'pretrained'"),
+        ({"max_cycles": 9}, "max_cycles has no effect with policy 'pretrained'"),
+        ({"guidance_reach": 3}, "guidance_reach has no effect with guidance 0"),
+    ],
+)
+def test_options_without_effect_are_refused(options, said):
+    """What a trained policy brings along cannot be chosen, and reach is nothing without guidance.
+
+    Of a policy without a run each of them counts, and reach counts beside guidance.
+    """
+    with pytest.raises(ValueError, match=said):
+        script.Args("pretrained", **options)
+    script.Args("nearest", guidance=0.5, **options)

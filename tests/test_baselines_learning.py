@@ -1,6 +1,8 @@
 """The parts a learner is made of: targets, memory, guidance, acting, and that they learn."""
 
 import copy
+import functools
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -8,9 +10,11 @@ import torch
 
 from baselines import meta_dqn, q_learner
 from baselines.guidance import Guidance, GuidedPolicy, LinearSchedule
+from baselines.independent_dqn import Args as IndependentArgs
+from baselines.independent_dqn import IndependentLearners
 from baselines.meta_dqn import Args, MetaLearner
 from baselines.networks import NetworkSpec, build_network, torch_generator
-from baselines.options import preset_options
+from baselines.options import parse_options, preset_options, without_effect
 from baselines.replay_memory import Batch, ReplayMemory
 from baselines.training import Streams, Training
 from mapp_env import Grid, make_grid
@@ -535,3 +539,123 @@ def test_bad_options_are_refused_by_name(name, value):
         ValueError, match=f"^{name} must be .*got {str(value)!r}".replace("'", ".?")
     ):
         meta_dqn.Args(**{name: value})
+
+
+# -- options -----------------------------------------------------------------------------------
+
+TINY = {
+    "n_agents": 2,
+    "n_landmarks": 2,
+    "max_cycles": 8,
+    "n_problems": 2,
+    "episodes_per_problem": 4,
+    "hidden_units": 8,
+    "code_units": 4,
+    "batch_size": 16,
+    "learning_starts": 8,
+    "updates_per_episode": 3,
+    "epsilon_end": 0.5,
+    "prefetch": False,
+}
+OTHERS = {
+    "code_units": 5,
+    "landmark_units": 3,
+    "route_units": 3,
+    "action_gap": 0.1,
+    "tried_actions": 3,
+    "temperature": 3.0,
+    "imagined_exploration": 0.6,
+    "imagined_from_depot": 0.1,
+    "imagined_length": 2,
+    "imagined_retries": 0.1,
+    "memory_size": 6,
+    "fresh_landmarks": 0.1,
+    "fresh_as_far": 0.1,
+    "final_reward": "geodesic",
+    "final_from": 0.7,
+    "final_discount": 0.5,
+    "final_reward_scale": 1.0,
+    "discount": 0.5,
+    "reward_scale": 0.4,
+    "target_rate": 0.5,
+    "epsilon_steps": 9,
+    "guidance_fraction": 0.2,
+    "guidance_reach": 1,
+}
+META, INDEPENDENT = (meta_dqn.Args, MetaLearner), (IndependentArgs, IndependentLearners)
+
+
+def outcome(kind, choice, **changes):
+    """Return what a tiny training logs, and the weights it ends with."""
+    return trained(kind, tuple({**choice, **changes}.items()))
+
+
+@functools.cache
+def trained(kind, changes):
+    """Train with one thread."""
+    options, learner = kind
+    args = options(**{**TINY, **dict(changes)})
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    grid = Grid.from_text("..#\n.D.\n...\n#..")
+    training = Training(
+        args, grid, np.array([[0, 5], [3, 11]]), learner(args, grid, Streams.spawn(0))
+    )
+    rows = []
+    while not training.finished:
+        row = training.advance()
+        rows += [row] if row else []
+    torch.set_num_threads(threads)
+    weights = training.learner.policy().network.state_dict()
+    return rows, {name: tensor.tolist() for name, tensor in weights.items()}
+
+
+@pytest.mark.parametrize(
+    ("kind", "choice"),
+    [
+        (META, {}),
+        (META, {"network": "paper"}),
+        (META, {"replay": "stored"}),
+        (META, {"tried_actions": 1}),
+        (META, {"final_reward": "same"}),
+        (META, {"final_from": 0.0}),
+        (META, {"final_from": 1.0}),
+        (META, {"target_interval": 3}),
+        (META, {"epsilon_start": 0.5}),
+        (META, {"guidance_start": 0.5, "guidance_end": 0.5}),
+        (INDEPENDENT, {}),
+        (INDEPENDENT, {"replay": "stored"}),
+    ],
+)
+def test_what_is_refused_as_without_effect_has_none(kind, choice):
+    """All options that a choice leaves without effect, changed at once, change no row, no weight.
+
+    Together these choices refuse every option of the list above at some time.
+    """
+    options, _ = kind
+    own = {field.name for field in fields(options)}
+    idle = [name for name in without_effect(options(**{**TINY, **choice})) if name in own]
+    assert idle
+    assert set(idle) <= set(OTHERS)
+    changes = {name: OTHERS[name] for name in idle}
+    assert outcome(kind, choice, **changes) == outcome(kind, choice)
+    for name in idle:
+        chosen = {**choice, "epsilon_end": 0.5, name: OTHERS[name]}
+        words = [f"--{key}={value}" for key, value in chosen.items()]
+        with pytest.raises(ValueError, match=f"^{name} has no effect with"):
+            parse_options(options, "", words)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_what_is_not_refused_has_an_effect(name):
+    """Each of these options, where nothing leaves it without effect, changes the training."""
+    changes = {
+        "fresh_landmarks": (INDEPENDENT, {}),
+        "fresh_as_far": (INDEPENDENT, {}),
+        "memory_size": (META, {"replay": "stored"}),
+        "guidance_reach": (META, {"guidance_start": 1.0}),
+        "guidance_fraction": (META, {"guidance_start": 1.0}),
+    }
+    kind, choice = changes.get(name, (META, {}))
+    assert name not in without_effect(kind[0](**{**TINY, **choice}))
+    assert outcome(kind, choice, **{name: OTHERS[name]}) != outcome(kind, choice)

@@ -164,6 +164,15 @@ def test_updates_of_the_default_preset_can_be_fewer(tmp_path):
     trials = compare.plan_trials(args, [])
     updates = {trial.group[0]: trial.options.updates_per_episode for trial in trials}
     assert updates == {"default": 7, "paper": 0}
+    with pytest.raises(ValueError, match=r"default_updates has no effect with presets .*paper"):
+        tiny(tmp_path, default_updates=7)
+
+
+def test_options_without_effect_in_a_training_are_refused(tmp_path):
+    """Every training takes what is handed to all: else by the name of both options, beforehand."""
+    with pytest.raises(ValueError, match="tried_actions has no effect with replay 'stored'"):
+        compare.main(tiny(tmp_path), [*WORDS, "--tried-actions", "4"])
+    assert not any(tmp_path.iterdir())
 
 
 def test_failed_training_is_reported(tmp_path, monkeypatch):

@@ -2,14 +2,24 @@
 
 import os
 import signal
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from baselines import distill, imitation
+from baselines import (
+    distill,
+    imitation,
+    independent_dqn,
+    meta_dqn,
+    repair,
+    self_improve,
+)
 from baselines.evaluation import Setting, evaluate, find_optima, unseen_problems
 from baselines.exact_values import steps_left
+from baselines.options import parse_options
 from baselines.policy import load_policy
 from mapp_env import Grid, make_grid, sample_problems
 from mapp_env.solvers import optimal_costs
@@ -208,6 +218,17 @@ def test_what_is_wrong_with_a_checkpoint_is_said(tmp_path, monkeypatch, forge):
     with pytest.raises(ValueError, match=r"checkpoints to go on from are gone"):
         distill.main(distill.Args(resume=folder))
     assert len((folder / "metrics.csv").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize("script", [distill, repair, self_improve, meta_dqn, independent_dqn])
+def test_a_resumed_run_takes_no_options(script, monkeypatch):
+    """On the command line not even one with its default: the run may have another."""
+    monkeypatch.setattr(sys, "argv", ["script", "--resume", "run", "--seed", "0"])
+    read = parse_options if hasattr(script.Args, "OUTPUTS") else imitation.parse_arguments
+    with pytest.raises(ValueError, match=r"resume goes on with the run's own options.* seed$"):
+        read(script.Args, "")
+    monkeypatch.setattr(sys, "argv", ["script", "--resume", "run"])
+    assert read(script.Args, "").resume == Path("run")
 
 
 def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):

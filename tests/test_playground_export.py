@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.export_playground import COMMAND, PLAYGROUND, export, kept_rows
+from baselines.export_playground import COMMAND, PLAYGROUND, Args, export, kept_rows
 from baselines.lookups import arrange, between_landmarks, routes
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.policy import load_policy, save_policy
@@ -108,6 +108,12 @@ def test_what_the_page_cannot_run_is_refused(changes, said, tmp_path):
 def test_a_run_of_the_pages_setting_is_taken(tmp_path):
     """The policy that the refused ones above differ from in one thing is exported."""
     assert '"head.advantages.bias"' in export(save_run(tmp_path))
+
+
+def test_where_to_write_is_no_matter_where_nothing_is_written(tmp_path):
+    """Counting what rounding changes takes no file."""
+    with pytest.raises(ValueError, match="out has no effect with rounding"):
+        Args(out=tmp_path / "weights.js", rounding=True)
 
 
 def test_the_pages_colours_are_the_palettes():

@@ -72,7 +72,7 @@ def test_fine_tuning_never_makes_it_worse():
     """The policy's own episode is one of those played, so what counts is at least as good."""
     problem = solve.make_problem(SETTING, CELLS)
     before = solve.solve_by_policy(untrained(), SETTING, problem)
-    args = finetune.Args(landmarks=CELLS, episodes=1, imagined=16)
+    args = finetune.Args(landmarks=CELLS, episodes=1)
     after, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
     assert n_episodes == 1
     assert (after.success, after.cover_time) == (before.success, before.cover_time)
@@ -124,9 +124,16 @@ def test_nothing_to_fine_tune_is_said(folder, monkeypatch, capsys):
 
 
 def test_what_cannot_be_fine_tuned_is_refused(folder):
-    """Landmarks beside a number of problems, and a team of too many joint actions."""
+    """What is drawn beside many problems, learning without episodes, too many joint actions."""
     with pytest.raises(ValueError, match="problems takes no landmarks"):
         finetune.Args(landmarks=CELLS, problems=2)
+    for name in ("picture", "plan", "animation"):
+        with pytest.raises(ValueError, match=f"problems takes no {name}"):
+            finetune.Args(problems=2, **{name: folder / "out"})
+    for changes in ({"imagined": 9}, {"updates_per_episode": 9}, {"patience": 9}):
+        finetune.Args(landmarks=CELLS, episodes=10, **changes)
+        with pytest.raises(ValueError, match=r"has no effect with episodes 9 and random_episodes"):
+            finetune.Args(landmarks=CELLS, episodes=9, **changes)
     spec = NetworkSpec("paper", 7, 2, 4, 25, 8)
     large = NetworkPolicy(build_network(spec, torch_generator(np.random.SeedSequence(0))))
     problem = mapp_env.Problem(GRID, CELLS, 7)
