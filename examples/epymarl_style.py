@@ -150,7 +150,7 @@ def main(args: Args) -> None:
     rng = np.random.default_rng(args.seed)
     env = gymnasium.make("mapp_env:mapp_env/Tuple-v0", observation="geodesic")
     env.reset(seed=args.seed)
-    n_agents, limit = env.unwrapped.n_agents, env.unwrapped.task.max_cycles
+    n_agents, limit = env.unwrapped.n_agents, env.unwrapped.max_cycles
     n_features = env.observation_space[0].shape[0] + n_agents
     network = make_network(n_features, int(env.action_space[0].n))
     target = copy.deepcopy(network)

@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from mapp_env.display import Display
+from mapp_env.problem import MAX_CYCLES
 from mapp_env.simulation import Simulation
 from mapp_env.task import RENDER_MODES, Task
 from mapp_env.validation import MAX_SEED, check_count
@@ -38,6 +39,15 @@ class SimulationEnv(gymnasium.Env[Any, Any]):
         self._simulation = Simulation(task, n_views)
         self._started = False
         self._display = Display(task.render_mode, self.metadata["render_fps"])
+
+    @property
+    def max_cycles(self) -> int:
+        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
+        return self._simulation.max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        self._simulation.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
 
     def _start(
         self, seed: int | None, options: dict[str, Any] | None

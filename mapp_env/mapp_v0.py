@@ -22,7 +22,22 @@ __all__ = ["env", "parallel_env", "raw_env"]
 parallel_env = MappParallelEnv
 
 
-class MappAECEnv(parallel_to_aec_wrapper):
+class HasLimit:
+    """What is assigned to ``max_cycles`` of an AEC form reaches the environment inside."""
+
+    unwrapped: MappParallelEnv
+
+    @property
+    def max_cycles(self) -> int:
+        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
+        return self.unwrapped.max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        self.unwrapped.max_cycles = value
+
+
+class MappAECEnv(HasLimit, parallel_to_aec_wrapper):
     """The AEC form, in which a bad action is refused when it is given, not when all agents move."""
 
     def step(self, action: int | None) -> None:
@@ -39,12 +54,16 @@ class MappAECEnv(parallel_to_aec_wrapper):
         super().step(action)
 
 
+class OrderedAECEnv(HasLimit, OrderEnforcingWrapper):
+    """The AEC form that refuses calls in the wrong order."""
+
+
 def env(**arguments: Any) -> AECEnv[str, Any, Any]:
     """Return the environment in PettingZoo's AEC form, which refuses calls in the wrong order.
 
     Parameters are those of :class:`mapp_env.parallel_env.MappParallelEnv`.
     """
-    return OrderEnforcingWrapper(MappAECEnv(parallel_env(**arguments)))
+    return OrderedAECEnv(MappAECEnv(parallel_env(**arguments)))
 
 
 def raw_env(**arguments: Any) -> AECEnv[str, Any, Any]:

@@ -34,6 +34,8 @@ class Rows:
         See :mod:`mapp_env.dynamics`.
     limits : ndarray of int64, shape (B,)
         Step limit of each row's episode.
+    max_cycles : int
+        Step limit of the episodes to come that do not bring their own.
     """
 
     def __init__(self, task: Task, n_rows: int, n_views: int) -> None:
@@ -41,6 +43,7 @@ class Rows:
         self.n_rows = n_rows
         self.state = np.zeros((n_rows, row_length(task.n_agents, task.n_landmarks)), np.int32)
         self.limits = np.full(n_rows, task.max_cycles, np.int64)
+        self.max_cycles = task.max_cycles
         self._every_row = np.arange(n_rows)
         # What the kernels take at every call, gathered once: for a single row, looking it up would
         # take longer than a step.
@@ -85,7 +88,7 @@ class Rows:
         landmarks : ndarray of int32, shape (M, K), optional
             The landmarks, if they are not to be drawn.
         limit : int, optional
-            Step limit of these episodes; by default the task's.
+            Step limit of these episodes; by default ``max_cycles``.
         """
         task = self.task
         if landmarks is None:
@@ -104,7 +107,7 @@ class Rows:
         if task.needs_fields:
             queue = np.empty(task.grid.n_cells, np.int32)
             fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
-        self.limits[indices] = task.max_cycles if limit is None else limit
+        self.limits[indices] = self.max_cycles if limit is None else limit
         if self._trails is not None:
             for index in indices:
                 self._trails[index].clear()

@@ -18,6 +18,7 @@ from mapp_env.central_env import CentralEnv, central_action_space
 from mapp_env.display import Display
 from mapp_env.grid import Grid
 from mapp_env.observation import Observation
+from mapp_env.problem import MAX_CYCLES
 from mapp_env.reset_options import check_problems, check_reset_mask
 from mapp_env.row_loops import find_bad_action
 from mapp_env.row_seeds import RowSeeds
@@ -128,6 +129,18 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             np.empty((0, *self.single_observation_space.shape), np.float32),
             np.empty((0, task.n_agents, task.n_actions), np.int8),
         )
+
+    @property
+    def max_cycles(self) -> int:
+        """Step at which an episode is truncated (R7).
+
+        May be assigned, for all rows: a row's episode keeps the limit that it was reset with.
+        """
+        return self._rows.max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        self._rows.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
 
     # -- seeds -------------------------------------------------------------------------
 

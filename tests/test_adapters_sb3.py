@@ -423,14 +423,18 @@ def test_agents_that_share_a_network_see_who_they_are() -> None:
         (lambda: make_sb3_vec(2).set_options({"reset_mask": np.ones(2, bool)}), "reset_mask"),
         (lambda: make_sb3_vec(2, render_mode="ansi"), "render_mode"),
         (lambda: make_sb3_shared(2).set_options([{}, {}]), "options"),
-        (lambda: make_sb3_vec(2).set_attr("max_cycles", 3), "max_cycles"),
+        (lambda: make_sb3_vec(2).set_attr("n_agents", 2), "n_agents"),
+        (lambda: make_sb3_vec(2).set_attr("max_cycles", 0), "max_cycles"),
+        (lambda: make_sb3_vec(2).set_attr("max_cycles", 3, indices=[0]), "indices"),
         (lambda: make_sb3_vec(2).env_method("state"), "state"),
         (lambda: make_sb3_vec(2).seed(-1), "seed"),
         (lambda: make_sb3_shared(2).seed(-1), "seed"),
         (lambda: make_sb3_shared(0), "num_envs"),
         (lambda: make_sb3_shared(1, render_mode="ansi"), "render_mode"),
         (lambda: SharedVecEnv(make_sb3_shared(1).venv, 2), "n_agents"),
-        (lambda: make_sb3_shared(1).set_attr("max_cycles", 3), "max_cycles"),
+        (lambda: make_sb3_shared(1).set_attr("n_agents", 2), "n_agents"),
+        (lambda: make_sb3_shared(1).set_attr("max_cycles", 0), "max_cycles"),
+        (lambda: make_sb3_shared(1).set_attr("max_cycles", 3, indices=[0, 2]), "indices"),
         (lambda: make_sb3_shared(1).env_method("state"), "state"),
     ],
 )
@@ -438,6 +442,34 @@ def test_refusals_name_the_argument(call: Callable[[], Any], named: str) -> None
     """What cannot be meant is refused with a ValueError that names it."""
     with pytest.raises(ValueError, match=named):
         call()
+
+
+@pytest.mark.parametrize("wrapped", [False, True], ids=["bare", "wrapped"])
+@pytest.mark.parametrize("form", FORMS)
+def test_max_cycles_may_be_set(form: str, wrapped: bool) -> None:
+    """set_attr and an assignment change the limit of all rows, from each row's next reset on."""
+    made: dict[str, Any] = {"n_landmarks": 40, "max_cycles": 12}
+    envs: Any = (
+        make_sb3_shared(2, **made)
+        if form == "shared"
+        else make_sb3_vec(3, central_action=form, **made)
+    )
+    outer = VecNormalize(envs, norm_obs=False) if wrapped else envs
+    outer.reset()
+    rows = range(envs.num_envs)
+    outer.set_attr("max_cycles", 5, indices=None if wrapped else rows)
+    assert outer.get_attr("max_cycles") == [5] * envs.num_envs
+    ends = [step for step in range(1, 24) if outer.step(np.zeros(_shape(envs), int))[2].all()]
+    assert ends == [12, 17, 22]  # the first episode had begun
+    envs.max_cycles = 3
+    outer.reset()
+    ends = [step for step in range(1, 7) if outer.step(np.zeros(_shape(envs), int))[2].all()]
+    assert ends == [3, 6]
+
+
+def _shape(envs: Any) -> tuple[int, ...]:
+    """Return the shape of a batch of actions."""
+    return (envs.num_envs, *envs.action_space.shape)
 
 
 def test_rows_have_no_attributes_of_their_own() -> None:

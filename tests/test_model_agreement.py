@@ -480,19 +480,99 @@ def test_drawn_landmarks_are_uniform_over_the_allowed_cells() -> None:
     assert len({tuple(sorted(row)) for row in drawn.tolist()}) > 0.98 * n_rows
 
 
-def test_max_cycles_may_be_assigned() -> None:
-    """Assigning max_cycles between episodes changes the step that truncates."""
-    env = mapp_v0.parallel_env(max_cycles=50, n_landmarks=40)
-    for limit in (3, 7):
-        env.max_cycles = limit
+def play_parallel(env: Any) -> int:
+    """Play an episode without a visit on a PettingZoo parallel face; return its length."""
+    length = 0
+    while env.agents:
+        *_, truncations, _ = env.step(dict.fromkeys(env.agents, 0))
+        length += 1
+    assert all(truncations.values())
+    return length
+
+
+def play_aec(env: Any) -> int:
+    """Do so agent by agent."""
+    length = 0
+    while env.agents:
+        ended = env.truncations[env.agent_selection]
+        length += not ended and env.agent_selection == env.possible_agents[0]
+        env.step(None if ended else 0)
+    return length
+
+
+def play_gymnasium(env: Any) -> int:
+    """Do so on a Gymnasium face."""
+    length, truncated = 0, False
+    while not truncated:
+        *_, truncated, _ = env.step(env.action_space.sample())
+        length += 1
+    return length
+
+
+@pytest.mark.parametrize(
+    ("make", "play"),
+    [
+        (mapp_v0.parallel_env, play_parallel),
+        (mapp_v0.raw_env, play_aec),
+        (mapp_v0.env, play_aec),
+        (lambda **more: gymnasium.make("mapp_env/Central-v0", **more).unwrapped, play_gymnasium),
+        (lambda **more: gymnasium.make("mapp_env/Tuple-v0", **more).unwrapped, play_gymnasium),
+    ],
+    ids=["parallel", "aec", "ordered aec", "central", "tuple"],
+)
+def test_max_cycles_may_be_assigned(make: Any, play: Any) -> None:
+    """An assigned max_cycles is read back, truncates the next episodes, and not the present one."""
+    env = make(max_cycles=20, n_landmarks=40)
+    limit = 20
+    for following in (3, 30, 7):
         env.reset(seed=1)
-        lengths = 0
-        while env.agents:
-            _, _, terminations, truncations, _ = env.step(dict.fromkeys(env.agents, 0))
-            lengths += 1
-        assert lengths == limit
-        assert all(truncations.values())
-        assert not any(terminations.values())
+        env.max_cycles = following
+        assert env.max_cycles == env.unwrapped.max_cycles == following
+        assert play(env) == limit
+        limit = following
+    with pytest.raises(ValueError, match="max_cycles must be an integer in 1"):
+        env.max_cycles = 0
+    env.reset()
+    assert play(env) == env.max_cycles == 7
+
+
+def test_wrappers_hand_max_cycles_on() -> None:
+    """Gymnasium's set_attr and set_wrapper_attr reach the limit of the environments inside."""
+    env = gymnasium.make("mapp_env/Central-v0", n_landmarks=40)
+    env.set_wrapper_attr("max_cycles", 4)
+    env.reset(seed=0)
+    assert play_gymnasium(env) == env.get_wrapper_attr("max_cycles") == 4
+    envs = gymnasium.make_vec("mapp_env/Central-v0", 2, vectorization_mode="sync", n_landmarks=40)
+    envs.set_attr("max_cycles", [3, 5])
+    envs.reset(seed=0)
+    ends = [envs.step(envs.action_space.sample())[3].tolist() for _ in range(5)]
+    assert ends == [[False, False]] * 2 + [[True, False], [False, False], [False, True]]
+    assert envs.get_attr("max_cycles") == (3, 5)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_max_cycles_of_a_batch_may_be_assigned(mode: str) -> None:
+    """It counts for the rows that are reset later, by themselves or not; a row under way stays."""
+    envs = mapp_env.make_vec(3, autoreset_mode=mode, max_cycles=4, n_landmarks=40)
+    envs.reset(seed=0)
+    actions = np.zeros((3, 3), int)
+    envs.step(actions)
+    envs.max_cycles = 6
+    mask = np.array([True, False, False])
+    envs.reset(options={"reset_mask": mask})  # row 0 begins, with six steps to go
+    late = 1 if mode == "NextStep" else 0  # a step that only resets
+    ends: list[list[int]] = [[], [], []]
+    for step in range(1, 13):
+        truncated = envs.step(actions)[3]
+        for row in np.flatnonzero(truncated):
+            ends[row].append(step)
+        if mode == "Disabled" and truncated.any():
+            envs.reset(options={"reset_mask": truncated})
+    assert ends == [[6] if late else [6, 12], [3, 9 + late], [3, 9 + late]]
+    assert envs.max_cycles == 6
+    with pytest.raises(ValueError, match="max_cycles must be an integer in 1"):
+        envs.max_cycles = 2.5  # type: ignore[assignment]
+    assert envs.max_cycles == 6
 
 
 @pytest.mark.parametrize("kind", ["global", "geodesic"])

@@ -15,6 +15,9 @@ __all__ = ["RowsVecEnv"]
 MASKS = "action_masks"
 """The one method that can be called by row: sb3-contrib's ``MaskablePPO`` does."""
 
+LIMIT = "max_cycles"
+"""The one attribute that can be set."""
+
 
 class RowsVecEnv(VecEnv):
     """Rows of one batch that has all attributes and methods itself.
@@ -48,24 +51,37 @@ class RowsVecEnv(VecEnv):
         mask: NDArray[np.bool_] = self.action_masks()[row]
         return mask
 
+    @property
+    @abstractmethod
+    def max_cycles(self) -> int:
+        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
+
+    @max_cycles.setter
+    @abstractmethod
+    def max_cycles(self, value: int) -> None: ...
+
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return the batch's attribute, or the spaces of a row, once for each row asked for."""
         rows = list(self._get_indices(indices))
-        if attr_name in ("observation_space", "action_space"):
+        if attr_name in ("observation_space", "action_space", LIMIT):
             return [getattr(self, attr_name)] * len(rows)  # the batch's are those of all rows
         if attr_name == MASKS:
             return [partial(self._mask_of, row) for row in rows]
         return [getattr(self._batch, attr_name)] * len(rows)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuse: rows have no attributes of their own.
+        """Set ``max_cycles``, of all rows; refuse all else, as rows have no other attributes.
 
         Raises
         ------
         ValueError
-            Always.
+            If it is another attribute, no limit, or of some rows only.
         """
-        raise ValueError(f"{attr_name} cannot be set: rows of .{self._name} have no attributes")
+        if attr_name != LIMIT:
+            raise ValueError(f"{attr_name} cannot be set: rows of .{self._name} have no attributes")
+        if len(set(self._get_indices(indices))) < self.num_envs:
+            raise ValueError(f"indices must be all rows, or None, for {LIMIT}; got {indices}")
+        self.max_cycles = value
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any

@@ -55,6 +55,22 @@ class SharedVecEnv(RowsVecEnv):
         self._masks: NDArray[np.bool_] | None = None  # (B, A), once there are episodes
         super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
+    @property
+    def max_cycles(self) -> int:
+        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
+        limit: int = self._teams[0].max_cycles
+        return limit
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        for team in self._teams:
+            team.max_cycles = value
+
+    @property
+    def _teams(self) -> list[MappParallelEnv]:
+        """The environments, one a team."""
+        return [one.par_env.unwrapped for one in self.venv.vec_envs]  # type: ignore[attr-defined]
+
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next :meth:`reset`.
 

@@ -103,6 +103,15 @@ class MappSb3VecEnv(RowsVecEnv):
             self.engine.single_action_space,
         )
 
+    @property
+    def max_cycles(self) -> int:
+        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
+        return self.engine.max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        self.engine.max_cycles = value
+
     # -- episodes ----------------------------------------------------------------------
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
