@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.dynamics import row_length
+from mapp_env.problem import MAX_CYCLES
 from mapp_env.row_loops import fill_fields, measure_rows, observe_rows, reset_rows, step_rows
 from mapp_env.scene import TRAIL_MOVES, Scene
 from mapp_env.task import Task
@@ -36,6 +37,8 @@ class Rows:
         Step limit of each row's episode.
     max_cycles : int
         Step limit of the episodes to come that do not bring their own.
+    longest : int
+        Upper bound of every step limit, whoever sets it.
     """
 
     def __init__(self, task: Task, n_rows: int, n_views: int) -> None:
@@ -44,6 +47,7 @@ class Rows:
         self.state = np.zeros((n_rows, row_length(task.n_agents, task.n_landmarks)), np.int32)
         self.limits = np.full(n_rows, task.max_cycles, np.int64)
         self.max_cycles = task.max_cycles
+        self.longest = MAX_CYCLES
         self._every_row = np.arange(n_rows)
         # What the kernels take at every call, gathered once: for a single row, looking it up would
         # take longer than a step.
@@ -107,7 +111,7 @@ class Rows:
         if task.needs_fields:
             queue = np.empty(task.grid.n_cells, np.int32)
             fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
-        self.limits[indices] = self.max_cycles if limit is None else limit
+        self.limits[indices] = min(self.max_cycles if limit is None else limit, self.longest)
         if self._trails is not None:
             for index in indices:
                 self._trails[index].clear()

@@ -372,9 +372,32 @@ def make_vec(num_envs: int, **arguments: Any) -> MappVectorEnv:
     return MappVectorEnv(num_envs, **arguments)
 
 
-def make_gymnasium_vec(num_envs: int, **arguments: Any) -> MappVectorEnv:
-    """Return what ``gymnasium.make_vec("mapp_env/Central-v0")`` means: the single one's actions."""
-    return MappVectorEnv(num_envs, **{"central_action": "auto", **arguments})
+def make_gymnasium_vec(
+    num_envs: int, max_episode_steps: int | None = None, **arguments: Any
+) -> MappVectorEnv:
+    """Return what ``gymnasium.make_vec("mapp_env/Central-v0")`` means: the single one's actions.
+
+    Parameters
+    ----------
+    num_envs : int
+        Number of rows, 1 to 1,048,576.
+    max_episode_steps : int, optional
+        Step at which every episode is truncated that goes on so long, as Gymnasium's ``TimeLimit``
+        does it; None or -1 for the environment's own limits alone. Such an episode has metrics like
+        any other, and one that is solved at that very step is terminated only (R7).
+    **arguments
+        Those of :class:`MappVectorEnv`, but that ``central_action`` is ``"auto"`` by default.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as said.
+    """
+    envs = MappVectorEnv(num_envs, **{"central_action": "auto", **arguments})
+    if max_episode_steps not in (None, -1):
+        name = "max_episode_steps"
+        envs._rows.longest = check_count(name, max_episode_steps, 1, np.iinfo(np.int64).max)
+    return envs
 
 
 def _find_mode(mode: object) -> AutoresetMode:

@@ -379,6 +379,74 @@ def test_joint_numbers_in_a_batch(same: Any) -> None:
             joint.step(np.array(bad))
 
 
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+@pytest.mark.parametrize("limit", [5, 12, 40, -1])
+def test_max_episode_steps_limit_as_in_sync_mode(
+    limit: int, mode: AutoresetMode, same: Any
+) -> None:
+    """gymnasium.make_vec(..., max_episode_steps=limit) ends every episode where sync mode does.
+
+    But for two things in which Gymnasium's wrapper is poorer: it calls an episode that is solved at
+    the very step a time-out, too, and those that it cuts short have no metrics.
+    """
+    make = {
+        "id": "mapp_env/Central-v0", "num_envs": 4, "max_episode_steps": limit,
+        "central_action": "multi", **settings(),
+    }  # fmt: skip
+    ours = gymnasium.make_vec(**make, autoreset_mode=mode)
+    theirs = gymnasium.make_vec(
+        **make, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}
+    )
+    seeds = [3, 4, 5, 6]
+    same(ours.reset(seed=seeds), theirs.reset(seed=seeds))
+    rng, solved_last, cut = np.random.default_rng(8), 0, 0
+    for _ in range(120):
+        actions = random_actions(rng, ours)
+        batch, rewards, terminations, truncations, infos = ours.step(actions)
+        wanted, gains, ends, cuts, theirs_infos = theirs.step(actions)
+        same((batch, rewards, terminations), (wanted, gains, ends))
+        same(truncations, cuts & ~ends)
+        solved_last += int((cuts & ends).sum())
+        cut += int(truncations.sum())
+        ended = terminations | truncations
+        if mode == AutoresetMode.SAME_STEP and ended.any():
+            same(infos["final_obs"], theirs_infos["final_obs"])
+            infos, theirs_infos = infos["final_info"], theirs_infos["final_info"]
+        same(infos["action_mask"], theirs_infos["action_mask"])
+        if ended.any():
+            same(infos["_metrics"], ended)
+            same(infos["metrics"]["success"], terminations)
+            own = theirs_infos.get("_metrics", np.zeros(4, bool))
+            for name in ("cover_time", "makespan", "total_distance"):
+                costs = infos["metrics"][name]
+                assert np.isinf(costs[truncations]).all()
+                if own.any():
+                    same(costs[own], theirs_infos["metrics"][name][own])
+        if mode == AutoresetMode.DISABLED and ended.any():
+            for venv in (ours, theirs):
+                venv.reset(options={"reset_mask": ended.copy()})
+    assert cut > 4
+    assert solved_last > 0 or limit in (-1, 40)
+
+
+def test_max_episode_steps_bounds_every_limit() -> None:
+    """It holds for limits that are assigned or brought by a problem, too, and must be a count."""
+    envs = gymnasium.make_vec("mapp_env/Central-v0", num_envs=2, max_episode_steps=4)
+    problem = mapp_env.Problem(mapp_env.make_grid(), (0, 6, 20, 42, 48), 3, max_cycles=9)
+    envs.max_cycles = 8
+    assert envs.max_cycles == 8
+    for options in (None, {"problem": problem}):
+        envs.reset(seed=0, options=options)
+        ends = [bool(envs.step(np.zeros(2, int))[3].all()) for _ in range(4)]
+        assert ends == [False, False, False, True]
+    again = gymnasium.make_vec(envs.spec)  # what it was made with is in its spec
+    again.reset(seed=0)
+    assert [bool(again.step(np.zeros(2, int))[3].all()) for _ in range(4)][-1]
+    for value in (0, -2, 2.5, True, "7"):
+        with pytest.raises(ValueError, match="max_episode_steps"):
+            gymnasium.make_vec("mapp_env/Central-v0", num_envs=2, max_episode_steps=value)
+
+
 @pytest.mark.parametrize("per_row", [True, False])
 def test_landmark_option(per_row: bool) -> None:
     """options["landmarks"] is one problem for all rows (K,), or one per row (B, K)."""
