@@ -5,11 +5,16 @@ Command::
     python baselines/evaluate.py --policy runs/meta_dqn-paper-seed0-... --problems 1000
     python baselines/evaluate.py --policy nearest --problems universe
 
-Output: a table with the share of problems solved; of the cover time the mean gap to the proven
-optimum, the share of optimal problems and the largest gap; and the means of all three costs. A
-problem is solved when every landmark was visited within the step limit; gaps and costs are those
-of the solved problems, and the cover time is shown a second time over all problems, an unsolved
-one counted with the step limit.
+Output: a table of the policy, two rules of thumb and the optimum, with the share of problems
+solved; of the cover time the mean gap to the proven optimum, the share of optimal problems and the
+largest gap; and the means of all three costs. A problem is solved when every landmark was visited
+within the step limit; gaps and costs are those of the solved problems, and the cover time is shown
+a second time over all problems, an unsolved one counted with the step limit. Optima are proven up
+to 20 landmarks; beyond, there are no gaps.
+
+The rules of thumb: "nearest landmark", in which each agent walks to the unvisited landmark nearest
+to itself, whatever the others do; and "earliest arrival", which gives each landmark to the agent
+that can be there first, one landmark after another, on its way from those it already has.
 """
 
 from dataclasses import dataclass
@@ -24,6 +29,7 @@ from baselines.checks import check_count, check_number
 from baselines.evaluation import (
     EVALUATION_SEED,
     MAX_EXACT_LANDMARKS,
+    RULES,
     Evaluation,
     count_problems,
     count_unseen,
@@ -32,18 +38,16 @@ from baselines.evaluation import (
     find_optima,
     format_table,
     out_of_reach,
+    rules_of_thumb,
     save_table,
     unseen_problems,
 )
 from baselines.guidance import Acting, Guidance, GuidedPolicy
-from baselines.policy import (
-    NearestLandmarkPolicy,
-    RandomPolicy,
-)
+from baselines.policy import RandomPolicy
 from baselines.settings import N_ACTIONS, Setting, find_grid
 from baselines.trained import load_trained
 
-RIVALS = ("random", "nearest")
+RIVALS = ("random", *RULES)
 SETTING = ("grid", "n_agents", "n_landmarks", "max_cycles")
 
 
@@ -52,8 +56,8 @@ class Args:
     """Options of an evaluation."""
 
     policy: str
-    """a pretrained policy's name, a run folder or a weights file; or "random", or "nearest" (each
-    agent walks a shortest path to its nearest unvisited landmark)"""
+    """a pretrained policy's name, a run folder or a weights file; or "random", "nearest" (landmark)
+    or "earliest" (arrival)"""
     problems: int | Literal["universe"] = 1000
     """number of distinct problems, none of them a training problem of the run; or "universe": all
     problems of the grid, training problems too"""
@@ -64,13 +68,15 @@ class Args:
     guidance_reach: int | None = None
     """with guidance: how many moves away a landmark is still close (3)"""
     grid: str | None = None
-    """bundled grid or map file, for "random" and "nearest" (paper-7x7); a run brings its own"""
+    """bundled grid or map file, for "random", "nearest" and "earliest" (paper-7x7); a run brings
+    its own"""
     n_agents: int | None = None
-    """number of agents, for "random" and "nearest" (3); a run brings its own"""
+    """number of agents, for "random", "nearest" and "earliest" (3); a run brings its own"""
     n_landmarks: int | None = None
-    """number of landmarks, for "random" and "nearest" (5); a run brings its own"""
+    """number of landmarks, for "random", "nearest" and "earliest" (5); a run brings its own"""
     max_cycles: int | None = None
-    """step limit of an episode, for "random" and "nearest" (50); a run brings its own"""
+    """step limit of an episode, for "random", "nearest" and "earliest" (50); a run brings its
+    own"""
     out: Path | None = None
     """folder for evaluation.csv and evaluation.md; nothing is written without it"""
     threads: int = 1
@@ -103,6 +109,7 @@ def main(args: Args) -> None:
             raise ValueError(f"out: cannot write into {args.out}: {error}") from error
     rng_policy, rng_guidance = np.random.default_rng(args.seed).spawn(2)
     seen: list[tuple[int, ...]] = []
+    label = args.policy
     policy: Acting
     if args.policy in RIVALS:
         values = {name: getattr(args, name) for name in SETTING[1:]}
@@ -111,10 +118,10 @@ def main(args: Args) -> None:
         if args.policy == "random":
             policy = RandomPolicy(setting.n_agents, N_ACTIONS, rng_policy)
         else:
-            policy = NearestLandmarkPolicy(setting.grid, setting.n_agents, setting.n_landmarks)
+            label, rule = RULES[args.policy]
+            policy = rule(setting.grid, setting.n_agents, setting.n_landmarks)
     else:
         policy, setting, seen = load_trained(args.policy)
-    label = args.policy
     if args.guidance > 0:
         reach = 3 if args.guidance_reach is None else args.guidance_reach
         guidance = Guidance(setting.grid, setting.n_agents, setting.n_landmarks, reach)
@@ -122,12 +129,15 @@ def main(args: Args) -> None:
         label += f" + guidance {args.guidance:g}"
     problems = choose_problems(args, setting, seen)
     optima = find_optima(setting, problems)
-    evaluation = evaluate(policy, setting, problems, optima, progress=label)
-    print(format_table({label: evaluation}))
-    for line in worst_cases(evaluation):
+    table = {
+        name: evaluate(acting, setting, problems, optima, progress=name)
+        for name, acting in {label: policy, **rules_of_thumb(setting)}.items()
+    }
+    print(format_table(table))
+    for line in worst_cases(table[label]):
         print(line)
     if args.out is not None:
-        save_table(args.out, {label: evaluation})
+        save_table(args.out, table)
 
 
 def choose_problems(args: Args, setting: Setting, seen: list[tuple[int, ...]]) -> np.ndarray:

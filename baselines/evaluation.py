@@ -17,6 +17,7 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.checks import check_count, check_grid
 from baselines.guidance import Acting
+from baselines.policy import MAX_TABLE_CELLS, EarliestArrivalPolicy, NearestLandmarkPolicy
 from baselines.settings import Setting
 from mapp_env import Problem, make_vec, sample_problems, solve
 from mapp_env.files import write_text
@@ -107,6 +108,29 @@ def _optimal_costs(setting: Setting, landmarks: np.ndarray, objective: str) -> n
     rows = tqdm(landmarks.tolist(), desc=f"optima: {objective}", leave=False, disable=None)
     problems = (Problem(setting.grid, row, setting.n_agents) for row in rows)
     return np.array([solve(problem, objective, "exact").cost for problem in problems], np.int32)
+
+
+# -- rules of thumb ----------------------------------------------------------------------------
+
+RULES = {
+    "nearest": ("nearest landmark", NearestLandmarkPolicy),
+    "earliest": ("earliest arrival", EarliestArrivalPolicy),
+}
+"""Rules without a network by what commands call them: how tables call them, and who they are."""
+
+
+def rules_of_thumb(setting: Setting) -> dict[str, Acting]:
+    """Return the rules that every table has beside the policies, by how tables call them.
+
+    There are none, and a line says so, on a grid for which the distances of all pairs of cells are
+    not kept.
+    """
+    if setting.grid.n_cells > MAX_TABLE_CELLS:
+        names = " and ".join(label for label, _ in RULES.values())
+        print(f"no rows for {names}: the grid has more than {MAX_TABLE_CELLS:,} cells")
+        return {}
+    task = setting.grid, setting.n_agents, setting.n_landmarks
+    return {label: rule(*task) for label, rule in RULES.values()}
 
 
 # -- playing -----------------------------------------------------------------------------------

@@ -27,18 +27,13 @@ from baselines.evaluation import (
     find_optima,
     format_table,
     out_of_reach,
+    rules_of_thumb,
     save_table,
     unseen_problems,
 )
 from baselines.guidance import Acting, Guidance, GuidedPolicy
 from baselines.options import Options, check_resumed
-from baselines.policy import (
-    MAX_TABLE_CELLS,
-    NearestLandmarkPolicy,
-    NetworkPolicy,
-    RandomPolicy,
-    save_policy,
-)
+from baselines.policy import NetworkPolicy, RandomPolicy, save_policy
 from baselines.runs import (
     METRICS_FILE,
     TIMING_FILE,
@@ -139,10 +134,7 @@ def evaluate_training(
         policies["random, guidance 1"] = guided(chance, 1.0)
     else:
         policies["random"] = chance
-    if grid.n_cells <= MAX_TABLE_CELLS:
-        policies["nearest landmark"] = NearestLandmarkPolicy(grid, args.n_agents, args.n_landmarks)
-    else:
-        print(f"no row for the nearest landmark: the grid has more than {MAX_TABLE_CELLS:,} cells")
+    policies.update(rules_of_thumb(setting))
     optima = find_optima(setting, problems)
     for line in out_of_reach(setting, optima):
         print(line)

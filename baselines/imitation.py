@@ -28,6 +28,7 @@ from baselines.evaluation import (
     evaluate,
     find_optima,
     format_table,
+    rules_of_thumb,
     save_table,
     unseen_problems,
 )
@@ -351,7 +352,10 @@ def run_imitation(
             problems = unseen_problems(setting, n_evaluated, seen)
             policy = load_policy(folder)  # as it was kept, so perhaps rounded
             optima = find_optima(setting, problems)
-            table = {"network alone": evaluate(policy, setting, problems, optima)}
+            table = {
+                label: evaluate(acting, setting, problems, optima)
+                for label, acting in {"network alone": policy, **rules_of_thumb(setting)}.items()
+            }
             save_table(folder, table)
             print(format_table(table))
     except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""Policies: who commands the agents. Trained networks from files, and two rivals without any.
+"""Policies: who commands the agents. Trained networks from files, and three rivals without any.
 
 A policy has one method, ``act(observations) -> actions``: global observations (B, N + 2K) to
 joint actions (B, N).
@@ -20,6 +20,7 @@ from baselines.runs import CONFIG_FILE, WEIGHTS_FILE, parse_json
 from baselines.settings import read_grid
 from mapp_env import Grid
 from mapp_env.files import read_bytes, write_bytes
+from mapp_env.solvers.earliest_arrival import assign_landmarks
 
 WEIGHTS_KEY = "mapp_env_policy"  # the one metadata entry of our safetensors files
 WEIGHTS_VERSION = 1
@@ -123,12 +124,33 @@ class NearestLandmarkPolicy:
         observations = check_observations(observations, n, k, len(self.distances))
         cells = observations[:, :n].astype(np.int64)
         landmarks = observations[:, n : n + k].astype(np.int64)
-        visited = observations[:, n + k :] > 0.5
-        steps = self.distances[cells[:, :, None], landmarks[:, None, :]].astype(np.int64)
-        steps[np.broadcast_to(visited[:, None, :], steps.shape)] = np.iinfo(np.int64).max
-        chosen = np.take_along_axis(landmarks, steps.argmin(axis=-1), axis=1)
-        actions: np.ndarray = self.first_moves[cells, chosen]
+        actions: np.ndarray = self.first_moves[
+            cells, self.choose(cells, landmarks, observations[:, n + k :] < 0.5)
+        ]
         return actions
+
+    def choose(self, cells: np.ndarray, landmarks: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Return the cell that each agent goes to, (B, N), by which landmarks are left, (B, K)."""
+        steps = self.distances[cells[:, :, None], landmarks[:, None, :]].astype(np.int64)
+        steps[np.broadcast_to(~left[:, None, :], steps.shape)] = np.iinfo(np.int64).max
+        chosen: np.ndarray = np.take_along_axis(landmarks, steps.argmin(axis=-1), axis=1)
+        return chosen
+
+
+class EarliestArrivalPolicy(NearestLandmarkPolicy):
+    """Of all agents and landmarks the pair that can meet first is settled first, then the next.
+
+    Each agent walks to the first landmark that falls to it, and stays, or steps to and fro, if none
+    does. Asked again at every step, it carries out the plan that it would have made at the start.
+    """
+
+    def choose(self, cells: np.ndarray, landmarks: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """Return the cell that each agent goes to, (B, N), by which landmarks are left, (B, K)."""
+        who, when = assign_landmarks(self.distances, cells, landmarks, left)
+        own = who[:, None, :] == np.arange(self.n_agents)[:, None]  # (B, N, K)
+        first = np.where(own, when[:, None, :], np.iinfo(np.int64).max).argmin(axis=-1)
+        chosen = np.take_along_axis(landmarks, first, axis=1)
+        return np.where(own.any(axis=-1), chosen, cells)
 
 
 def save_policy(path: Path, network: Network, half_precision: bool = False) -> None:

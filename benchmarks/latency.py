@@ -29,9 +29,9 @@ import numpy as np
 import torch
 
 from baselines.checks import check_grid
-from baselines.evaluation import Optima, evaluate, find_optima
+from baselines.evaluation import Optima, evaluate, find_optima, rules_of_thumb
 from baselines.guidance import Acting
-from baselines.policy import NearestLandmarkPolicy, NetworkPolicy, load_policy, pretrained_names
+from baselines.policy import NetworkPolicy, load_policy, pretrained_names
 from baselines.settings import Setting
 from mapp_env import Problem, make_grid, replay, sample_problems, solve
 from mapp_env.solvers import optimal_costs
@@ -149,8 +149,8 @@ def main() -> None:
     rows: list[Row] = []
     for name in args.policies:
         rows += policy_rows(name, policies[name], problems, many, optima)
-    nearest = NearestLandmarkPolicy(grid, n_agents, SETTING.n_landmarks)
-    rows += policy_rows("nearest landmark", nearest, problems, many, optima)[1:]
+    for label, rule in rules_of_thumb(SETTING).items():
+        rows += policy_rows(label, rule, problems, many, optima)[1:]
     solve(problems[0])
     whole = time_each(solve, problems)
     each = time_batch(lambda landmarks: optimal_costs(grid, landmarks, n_agents), many)

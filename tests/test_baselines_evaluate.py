@@ -1,7 +1,10 @@
 """Evaluation: the figures are those of the rules, on problems never trained on."""
 
 import dataclasses
+import importlib.util
 import itertools
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from baselines.evaluation import (
 from baselines.guidance import Guidance, GuidedPolicy
 from baselines.networks import NetworkSpec, build_network
 from baselines.policy import (
+    EarliestArrivalPolicy,
     NearestLandmarkPolicy,
     NetworkPolicy,
     RandomPolicy,
@@ -63,6 +67,68 @@ def test_nearest_landmark_solves_everything_and_chance_does_not():
     assert nearest["cover time"] == nearest["unsolved = 50"]
     assert 5.0 < chance["solved %"] < 25.0
     assert chance["cover time"] < chance["unsolved = 50"]
+
+
+def earliest_arrivals(problem: Problem) -> list[list[int]]:
+    """Return each agent's landmarks in order, by the rule as one would do it by hand."""
+    distances = problem.grid.distances
+    left = list(problem.landmarks)
+    at, steps = [problem.grid.depot] * problem.n_agents, [0] * problem.n_agents
+    routes: list[list[int]] = [[] for _ in at]
+    while left:
+        pairs = itertools.product(range(problem.n_agents), left)
+        agent, landmark = min(
+            pairs, key=lambda pair: steps[pair[0]] + distances[at[pair[0]], pair[1]]
+        )
+        steps[agent] += int(distances[at[agent], landmark])
+        at[agent] = landmark
+        routes[agent].append(landmark)
+        left.remove(landmark)
+    return routes
+
+
+@pytest.mark.parametrize("setting", [PAPER, WIDE, dataclasses.replace(WIDE, n_agents=5)])
+def test_earliest_arrival_is_its_plan(setting):
+    """Asked anew at every step the policy walks the routes that the rule lays down at the start."""
+    problems = unseen_problems(setting, 60)
+    policy = EarliestArrivalPolicy(setting.grid, setting.n_agents, setting.n_landmarks)
+    result = evaluate(policy, setting, problems, n_kept=len(problems))
+    for index, landmarks in enumerate(problems.tolist()):
+        problem = Problem(setting.grid, landmarks, setting.n_agents)
+        plan = replay(problem, result.actions[: result.steps[index], index])
+        assert [list(claims) for claims in plan.claims] == earliest_arrivals(problem)
+        assert plan.cover_time == result.cover_time[index]
+
+
+def test_earliest_arrival_is_the_solvers_benchmark(monkeypatch):
+    """A name stands for one rule: the policy costs what the method of this name costs there."""
+    monkeypatch.setattr(os, "environ", os.environ.copy())  # it sets how many threads there are
+    path = Path(__file__).parents[1] / "benchmarks" / "solvers.py"
+    spec = importlib.util.spec_from_file_location("benchmark_of_solvers", path)
+    benchmark = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(benchmark)
+    problems = unseen_problems(PAPER, 100)
+    _, rule = evaluation_module.RULES["earliest"]
+    result = evaluate(rule(PAPER.grid, 3, 5), PAPER, problems)
+    for objective in ("cover_time", "makespan"):
+        costs = [
+            benchmark.METHODS["earliest arrival"](Problem(PAPER.grid, row, 3), objective, 1.0).cost
+            for row in problems.tolist()
+        ]
+        assert getattr(result, objective).tolist() == costs
+
+
+@pytest.mark.parametrize("policy", ["random", "nearest", "earliest"])
+def test_both_rules_stand_beside_every_policy(policy, tmp_path):
+    """Whatever is evaluated, both rules of thumb have a row, under the names that documents use."""
+    script.main(script.Args(policy, 20, out=tmp_path))
+    rows = (tmp_path / "evaluation.csv").read_text().splitlines()[1:]
+    labels = [row.split(",")[0] for row in rows]
+    own = {"nearest": "nearest landmark", "earliest": "earliest arrival"}.get(policy, policy)
+    assert labels[0] == own
+    assert sorted(labels) == sorted(
+        {own, "nearest landmark", "earliest arrival", "optimum of each cost"}
+    )
 
 
 def test_size_of_the_batch_changes_nothing(monkeypatch):
@@ -301,7 +367,7 @@ def test_universe_is_every_problem(tmp_path, capsys):
     printed, errors = capsys.readouterr()
     table = (folder / "evaluation.md").read_text()
     assert printed.startswith(table)
-    assert "| nearest              |       36 |" in table
+    assert "| nearest landmark     |       36 |" in table
     assert "largest gap: landmarks" in printed
     assert errors == ""  # no bar where there is no terminal
 

@@ -13,6 +13,7 @@ from baselines.guidance import Guidance, GuidedPolicy
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.policy import (
     WEIGHTS_KEY,
+    EarliestArrivalPolicy,
     NearestLandmarkPolicy,
     NetworkPolicy,
     RandomPolicy,
@@ -232,6 +233,7 @@ def test_observations_the_env_cannot_give_are_refused(network, bad):
     for policy in (
         NetworkPolicy(network),
         NearestLandmarkPolicy(grid, 3, 5),
+        EarliestArrivalPolicy(grid, 3, 5),
         GuidedPolicy(chance, guidance, 1.0, np.random.default_rng(0)),
     ):
         with pytest.raises(ValueError, match=r"^observations must"):

@@ -112,7 +112,7 @@ def test_run_leaves_all_it_promises(two_runs):
     assert timing["steps"] == sum(int(row["steps"]) for row in rows)
     assert timing["updates"] == sum(int(row["updates"]) for row in rows)
     assert (run / "evaluation.md").read_text() in output
-    for label in ("network alone", "guidance", "random", "nearest landmark"):
+    for label in ("network alone", "guidance", "random", "nearest landmark", "earliest arrival"):
         assert label in output
 
 
@@ -146,7 +146,8 @@ def test_default_preset_leaves_all_it_promises(tmp_path, capsys):
     assert columns["guidance"] == [0.0] * 6
     assert columns["updates"][-1] == 3
     rows = list(csv.reader((args.out / "evaluation.csv").read_text().splitlines()))[1:]
-    labels = ["network alone", "random", "nearest landmark", "optimum of each cost"]
+    rules = ["nearest landmark", "earliest arrival"]
+    labels = ["network alone", "random", *rules, "optimum of each cost"]
     assert [row[0] for row in rows] == labels
     assert (args.out / "evaluation.md").read_text() in capsys.readouterr().out
     assert load_policy(args.out).spec.kind == "pairs"
@@ -338,8 +339,8 @@ SHORT = {
 }
 
 
-def test_large_grid_has_no_nearest_landmark_row(tmp_path, capsys):
-    """Above 4,096 cells a run ends well, and says which row of the table it leaves out."""
+def test_large_grid_has_no_rows_of_rules(tmp_path, capsys):
+    """Above 4,096 cells a run ends well, and says which rows of the table it leaves out."""
     (tmp_path / "large.txt").write_text(Grid(np.zeros((65, 65), dtype=bool)).to_text())
     grid = str(tmp_path / "large.txt")
     run = tmp_path / "run"
@@ -348,7 +349,8 @@ def test_large_grid_has_no_nearest_landmark_row(tmp_path, capsys):
     )
     assert meta_dqn.main(args) == 0
     output = capsys.readouterr().out
-    assert output.count("no row for the nearest landmark: the grid has more than 4,096 cells") == 1
+    said = "no rows for nearest landmark and earliest arrival: the grid has more than 4,096 cells"
+    assert output.count(said) == 1
     rows = list(csv.reader((run / "evaluation.csv").read_text().splitlines()))
     assert [row[0] for row in rows[-2:]] == ["random, guidance 1", "optimum of each cost"]
     assert (run / "fig4b_routes.png").exists()
