@@ -7,6 +7,10 @@ registry) and Gymnasium, and loads neither torch nor any drawing library.
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NoReturn
+
 import gymnasium
 import pettingzoo
 
@@ -62,6 +66,38 @@ def _register() -> None:
         ):
             if "mapp_env/mapp-v0" not in registry:
                 pettingzoo.register(kind, "mapp_env/mapp-v0", entry_point)
+
+
+_MEANT = {
+    "env": "mapp_env.mapp_v0.env()",
+    "raw_env": "mapp_env.mapp_v0.raw_env()",
+    "mapp_v0": "mapp_env.mapp_v0.parallel_env()",
+    "parallel_env": "mapp_env.mapp_v0.parallel_env()",
+    "central_env": 'gymnasium.make("mapp_env/Central-v0")',
+    "vector_env": "mapp_env.make_vec(num_envs)",
+}
+"""What is easily called for an environment, and what makes one."""
+
+
+class _Module(ModuleType):
+    """A module of the package that says what to call in its place."""
+
+    def __call__(self, *_arguments: Any, **_options: Any) -> NoReturn:
+        name = self.__name__
+        meant = _MEANT[name.removeprefix("mapp_env.")]
+        raise TypeError(f"{name} is a module: an environment is made by {meant}")
+
+
+for _name in _MEANT:
+    if f"mapp_env.{_name}" in sys.modules:
+        sys.modules[f"mapp_env.{_name}"].__class__ = _Module
+
+if not TYPE_CHECKING:  # for type checkers there would be no wrong name any more
+
+    def __getattr__(name: str) -> Any:
+        """Say where an environment is that is looked for at the top of the package."""
+        hint = f": an environment is made by {_MEANT[name]}" if name in _MEANT else ""
+        raise AttributeError(f"module 'mapp_env' has no attribute {name!r}{hint}", name=name)
 
 
 _register()

@@ -802,3 +802,27 @@ def test_unknown_argument() -> None:
     for make in FACES.values():
         with pytest.raises(TypeError, match="n_agent"):
             make(n_agent=3)
+
+
+@pytest.mark.parametrize(
+    "slip",
+    [
+        "mapp_env.parallel_env()",
+        "mapp_env.parallel_env(n_agents=2)",
+        "mapp_env.env()",
+        "mapp_env.raw_env()",
+        "mapp_env.mapp_v0()",
+        "mapp_env.central_env()",
+        "mapp_env.vector_env(4)",
+    ],
+)
+def test_what_is_not_an_environment_says_what_makes_one(slip: str) -> None:
+    """Whoever looks for an environment at the top of the package is told what to write, and can."""
+    names = {"mapp_env": mapp_env, "gymnasium": gymnasium, "num_envs": 4}
+    with pytest.raises((AttributeError, TypeError)) as caught:
+        eval(slip, names)
+    said = re.fullmatch(r".*mapp_env.*: an environment is made by (.*)", str(caught.value))
+    assert said is not None, str(caught.value)
+    eval(said[1], names).close()
+    with pytest.raises(AttributeError, match=r"module 'mapp_env' has no attribute 'maps'$"):
+        _ = mapp_env.maps
