@@ -1,7 +1,7 @@
 """How good a policy is: what it costs on many problems, beside the proven optimum of each.
 
 A problem is solved when every landmark was visited within the step limit. The gap of a solved
-problem is (cover time - optimum) / optimum.
+problem is (cover time - optimum) / optimum; optima are proven up to 20 landmarks.
 """
 
 import csv

@@ -1,4 +1,4 @@
-"""Multi-agent path planning on walled grids: a PettingZoo environment, batched, with its optimum.
+"""Multi-agent path planning on walled grids: a PettingZoo environment, also batched, and solvers.
 
 The system of Çetinkaya, "Multi-Agent Path Planning Using Deep Reinforcement Learning",
 arXiv 2110.01460. Importing this module registers the environments with PettingZoo (where it has a

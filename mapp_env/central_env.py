@@ -109,7 +109,7 @@ class CentralEnv(SimulationEnv):
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
 
     def __init__(

@@ -35,8 +35,8 @@ class Grid:
     walls : array_like of bool, shape (rows, cols)
         ``True`` where no agent can stand; 1 to 512 rows and columns.
     depot : int or (int, int), optional
-        The free cell, or its row and column, where all agents start and end. By default the free
-        cell nearest to the centre (smallest index among equals).
+        The free cell, or its row and column, where all agents start. By default the free cell
+        nearest to the centre (smallest index among equals).
 
     Attributes
     ----------

@@ -31,7 +31,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     """Multi-agent path planning on a walled grid: visit every landmark together, in few steps.
 
     Agents start on the depot and move at the same instant; a landmark is visited for good when an
-    agent steps on it; when all are, the episode ends. The rules R1 to R9 stand in docs/rules.md,
+    agent steps on it; when all are, the episode ends. The rules R1 to R9 are in docs/rules.md,
     after Çetinkaya, arXiv 2110.01460, sections 3 and 5.
 
     Parameters
@@ -58,7 +58,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own attribute; never changed here

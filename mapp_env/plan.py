@@ -46,9 +46,13 @@ class Plan:
         For each agent its cells, depot first and last, or empty if it claimed nothing (R8).
     claims : tuple of tuple of int
         For each agent the landmarks that it was the first on, in order.
-    cover_time, makespan, total_distance : int or float
-        Steps until every landmark is visited, steps until the last agent is home, cells moved by
-        all agents; ``math.inf`` if not every landmark is visited.
+    cover_time : int or float
+        Steps until every landmark is visited; ``math.inf`` if one is not.
+    makespan : int or float
+        Steps until the last agent is home, if each goes home after its last claim; ``math.inf``
+        if a landmark is not visited.
+    total_distance : int or float
+        Cells moved by all agents, the way home included; ``math.inf`` if a landmark is not visited.
     objective : {"cover_time", "makespan", "total_distance"}
         What :attr:`cost` is.
     status : {"optimal", "feasible", "infeasible"}
@@ -88,7 +92,7 @@ class Plan:
 
     @property
     def cost(self) -> float:
-        """The cost in :attr:`objective`: a whole number, or infinite."""
+        """The cost in :attr:`objective`, a whole number or infinite."""
         cost: float = getattr(self, self.objective)
         return cost
 

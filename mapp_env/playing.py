@@ -107,7 +107,7 @@ def play_row(
     Parameters
     ----------
     row, actions, n_agents, n_landmarks, table, distances, max_cycles
-        As of :func:`~mapp_env.dynamics.step_row`, but for all steps: actions are (T, N).
+        As in :func:`~mapp_env.dynamics.step_row`, but for all steps: actions are (T, N).
     cells : ndarray of int32, shape (T + 1, N)
         Where the agents are after each step.
     visits : ndarray of int64, shape (K,)

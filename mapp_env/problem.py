@@ -38,7 +38,7 @@ LOW_32_BITS = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be solved: visit every landmark with a team that starts and ends at the depot.
+    """What is to be solved: visit every landmark with a team that starts on the depot.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class Problem:
     Raises
     ------
     ValueError
-        If any of them is not as said; the message names argument, value and what is allowed.
+        If any of them is invalid; the message names argument, value and what is allowed.
     """
 
     grid: Grid

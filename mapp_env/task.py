@@ -72,7 +72,7 @@ class Task:
     Raises
     ------
     ValueError
-        If an argument is not as said, or what they ask for together would not fit in memory.
+        If an argument is invalid, or what they ask for together would not fit in memory.
     """
 
     grid: Grid

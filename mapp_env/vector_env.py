@@ -51,7 +51,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     """Many independent problems stepped at once, for one meta-agent (see ``CentralEnv``).
 
     Row ``i`` is bit for bit the single environment that is reset with seed ``np_random_seed[i]``.
-    Returned arrays are the caller's.
+    Returned arrays can be kept and written to: nothing in the environment changes with them.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
 
     def __init__(
@@ -358,7 +358,7 @@ def make_vec(num_envs: int, **arguments: Any) -> MappVectorEnv:
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
 
     Examples
     --------

@@ -11,7 +11,7 @@ __all__ = ["Transition", "make_infos"]
 
 
 class Transition(NamedTuple):
-    """A step of all B rows, M of which have ended; who steps the engine makes infos of it."""
+    """A step of all B rows, M of which have ended; whoever steps the engine makes infos from it."""
 
     observations: NDArray[np.float32]  # (B, ...), of the next episode in rows that restarted
     rewards: NDArray[np.float64]  # (B,)

@@ -186,7 +186,7 @@ def make_sb3_shared(num_envs: int, **arguments: Any) -> SharedVecEnv:
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
 
     Examples
     --------

@@ -75,7 +75,7 @@ class MappSb3VecEnv(RowsVecEnv):
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
 
     def __init__(self, num_envs: int, **arguments: Any) -> None:
@@ -289,7 +289,7 @@ def make_sb3_vec(num_envs: int, **arguments: Any) -> MappSb3VecEnv:
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
 
     Examples
     --------

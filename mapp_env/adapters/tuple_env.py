@@ -43,7 +43,7 @@ class TupleEnv(SimulationEnv):
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
 
     def __init__(

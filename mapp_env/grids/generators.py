@@ -44,7 +44,7 @@ def random_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, density: float
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
     rng = _start(rows, cols, 2, seed)
     density = _check_share("density", density, MAX_DENSITY)
@@ -79,7 +79,7 @@ def rooms_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, room: int = 5) 
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
     rng = _start(rows, cols, 3, seed)
     room = check_count("room", room, 2, MAX_SIDE // 2)
@@ -142,7 +142,7 @@ def maze_grid(*, rows: int = 33, cols: int = 33, seed: int = 0, loops: float = 0
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
     rng = _start(rows, cols, 3, seed)
     loops = _check_share("loops", loops, 1.0)
@@ -204,7 +204,7 @@ def warehouse_grid(
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
     rng = _start(rows, cols, 6, seed)
     length = check_count("shelf_length", shelf_length, 2, MAX_SIDE // 2)

@@ -73,7 +73,7 @@ def save_animation(
     Raises
     ------
     ValueError
-        If an argument is not as said, the animation would have more than 2,000 frames or 2**28
+        If an argument is invalid, the animation would have more than 2,000 frames or 2**28
         pixels, or the file cannot be written; nothing is written then.
     """
     side = check_count("max_side", max_side, 16, 1024)
@@ -100,7 +100,7 @@ def save_gif(
         the one before prolongs it. Of more than 255 colours in all, those that are rare become the
         most similar ones.
     fps, hold, loop
-        As of :func:`save_animation`.
+        As in :func:`save_animation`.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def save_gif(
     Raises
     ------
     ValueError
-        If an argument is not as said, there are more than 2,000 frames or 2**28 pixels, or the file
+        If an argument is invalid, there are more than 2,000 frames or 2**28 pixels, or the file
         cannot be written; nothing is written then.
     """
     return _save(path, frames, fps, hold, loop, None)

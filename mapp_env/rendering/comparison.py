@@ -46,12 +46,12 @@ def compare_plans(
     Returns
     -------
     matplotlib.figure.Figure
-        With one axes a plan, in their order; unknown to pyplot.
+        One axes for each plan, in their order; unknown to pyplot.
 
     Raises
     ------
     ValueError
-        If an argument is not as said, a plan is not one of this problem or costs less than the
+        If an argument is invalid, a plan is not one of this problem or costs less than the
         proven optimum, or the file cannot be written.
     """
     check_plans(problem, plans)

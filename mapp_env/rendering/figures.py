@@ -40,7 +40,7 @@ def draw_plan(
 ) -> Axes:
     """Draw the tours of a plan.
 
-    One colour and one train of arrows an agent: a full line to its last claim, a dashed one home.
+    A colour and a train of arrows for each agent: a full line to its last claim, a dashed one home.
     Routes keep to the right, and those that share a corridor run side by side, so that each can
     be followed both ways. The legend gives the length of every tour. Landmarks are red flags,
     as before a visit; those that the plan leaves out stand in a hatched frame.

@@ -40,9 +40,9 @@ def animate_plans(
 ) -> int:
     """Play plans of one problem side by side and write them as an animated GIF.
 
-    Above each stand its label and, once it is through, what it cost; if another of the plans is
-    proven optimal, its gap to that one: (cost - optimum) / optimum. All start together, and whoever
-    is through waits for the others.
+    Above each stand its label and, once it is done, what it cost; if another of the plans is
+    proven optimal, its gap to that one: (cost - optimum) / optimum. All start together, and those
+    that are done wait for the others.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def animate_plans(
     plans : mapping of str to Plan
         1 to 12, by what they are called: ``{"policy": ..., "optimum": ...}``.
     fps, hold, loop
-        As of :func:`~mapp_env.rendering.save_animation`.
+        As in :func:`~mapp_env.rendering.save_animation`.
     max_side : int
         Pixels that the longer side of one grid may take, 16 to 1024.
 
@@ -65,7 +65,7 @@ def animate_plans(
     Raises
     ------
     ValueError
-        If an argument is not as said, a plan is not one of this problem or costs less than the
+        If an argument is invalid, a plan is not one of this problem or costs less than the
         proven optimum, the animation would be too large, or the file cannot be written.
     """
     check_plans(problem, plans)
@@ -79,7 +79,7 @@ def animate_plans(
 
 
 def _outcome(plan: Plan, gap: Gap | None) -> str:
-    """Return what stands above a plan that is through."""
+    """Return what stands above a plan that is done."""
     if not plan.success:
         return "not every landmark is visited"
     proven = " (proven)" if plan.status == "optimal" and plan.objective == "cover_time" else ""

@@ -51,7 +51,7 @@ def solve(
         come first and a plan's tours last, however few seconds there are: together half a second
         for 64 landmarks on 512 x 512 cells, a second where tours have a hundred thousand cells.
     seed : int
-        Of a search.
+        For the random choices of a search.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def solve(
     Raises
     ------
     ValueError
-        If an argument is not as said, or the method cannot take the problem; the message names one
+        If an argument is invalid, or the method cannot take the problem; the message names one
         that can.
     """
     if not isinstance(problem, Problem):

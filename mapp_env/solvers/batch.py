@@ -74,7 +74,7 @@ def optimal_costs(
     Raises
     ------
     ValueError
-        If an argument is not as said, or a row is not a problem of the grid (rule R2); the message
+        If an argument is invalid, or a row is not a problem of the grid (rule R2); the message
         names the row.
     """
     check_grid("grid", grid)
