@@ -14,6 +14,7 @@ import mapp_env
 
 HERE = Path(__file__).parent
 PLAYGROUND = "playground"  # a page by itself, with scripts: copied as it is
+DRAFT = "pettingzoo_third_party.md"  # a pull request that has not been sent: no page of the site
 
 project = "mapp_env"
 author = "The mapp_env authors"
@@ -21,14 +22,16 @@ project_copyright = author
 version = release = mapp_env.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build", PLAYGROUND]
+exclude_patterns = ["_build", PLAYGROUND, DRAFT]
 myst_heading_anchors = 4  # links such as solvers.md#files, as GitHub makes them
 
 autodoc_member_order = "bysource"
-autodoc_mock_imports = ["stable_baselines3", "supersuit"]  # what adapters adapt to is not needed
+# What is drawn with and what adapters adapt to: not needed, and not in the extra `docs`.
+autodoc_mock_imports = ["matplotlib", "pygame", "stable_baselines3", "supersuit"]
 autodoc_typehints = "none"  # docstrings say types, shapes and units
 napoleon_google_docstring = False
 napoleon_use_ivar = True
+napoleon_use_param = False  # else what is said of several parameters at once is said of each
 
 html_theme = "furo"
 html_title = f"mapp_env {release}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import importlib
 import os
 import re
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -192,6 +194,40 @@ def test_tables_shown_twice_agree() -> None:
     assert twice >= 10
 
 
+def test_rules_of_thumb_stand_side_by_side() -> None:
+    """Where a table of policies has one rule of thumb it has the other, with its own figures."""
+    rules, found = ("nearest landmark", "earliest arrival"), 0
+    for path in DOCUMENTS:
+        for header, *body in tables(path):
+            rows = [[row for row in body if rule in " ".join(row)] for rule in rules]
+            assert len(rows[0]) == len(rows[1]), f"{path.name}: {header}"
+            found += len(rows[0])
+            for nearest, earliest in zip(*rows, strict=True):
+                assert nearest != earliest
+    assert found >= 7
+
+
+def test_citations_agree() -> None:
+    """CITATION.cff and README's BibTeX name this version, and the paper by the same DOI."""
+    cited = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text(encoding="utf-8"))
+    readme = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```bibtex\n(.*?)```", readme, re.DOTALL)
+    software, paper = re.findall(r"^@\w+\{.*?^\}$", block, re.MULTILINE | re.DOTALL)
+    fields = [
+        dict(re.findall(r"^  (\w+) = \{(.*)\},?$", entry, re.MULTILINE))
+        for entry in (software, paper)
+    ]
+    (reference,) = cited["references"]
+    released = datetime.date.fromisoformat(cited["date-released"])
+    version = importlib.import_module("mapp_env").__version__
+    assert cited["version"] == fields[0]["version"] == version
+    assert str(released.year) == fields[0]["year"]
+    assert fields[0]["title"].replace("\\", "") == cited["title"]
+    assert reference["doi"] == fields[1]["doi"] == "10.48550/arXiv." + fields[1]["eprint"]
+    assert fields[1]["title"] == reference["title"]
+    assert fields[1]["year"] == str(reference["year"])
+
+
 def test_each_logged_metric_is_explained() -> None:
     """The page about the baselines has a row for every column and entry that a run writes."""
     training = importlib.import_module("baselines.training")
@@ -223,7 +259,7 @@ def test_each_logged_metric_is_explained() -> None:
 
 def test_code_blocks_say_what_they_are() -> None:
     """Every block is Python or a command, which are run, or else text that nobody could run."""
-    known = {"python", "bash", "text", "markdown", "{eval-rst}"}
+    known = {"python", "bash", "text", "markdown", "bibtex", "{eval-rst}"}
     for path in DOCUMENTS:
         fences = re.findall(r"^\s*```(.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
         assert len(fences) % 2 == 0, path.name
