@@ -482,3 +482,31 @@ def test_rows_have_no_attributes_of_their_own() -> None:
     assert envs.get_attr("observation_space") == [envs.observation_space] * 3
     assert not envs.has_attr("nothing_of_this_name")
     assert envs.env_is_wrapped(gymnasium.Wrapper, indices=1) == [False]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_masks_of_some_rows_are_theirs(form: str) -> None:
+    """Masks by row are those of the rows asked for, in their order, and the caller's."""
+    envs = FORMS[form]()
+    envs.seed(3)
+    envs.reset()
+    for _ in range(3):
+        envs.step(batched_actions(envs, np.random.default_rng(1)))
+    masks = envs.action_masks()
+    kept = masks.copy()
+    for indices in ([1], [2, 0], 1):
+        rows = [indices] if isinstance(indices, int) else indices
+        found = envs.env_method("action_masks", indices=indices)
+        assert np.array_equal(np.stack(found), kept[rows])
+    masks[:] = ~masks
+    assert np.array_equal(envs.action_masks(), kept)
+
+
+def test_a_callback_can_be_used_again() -> None:
+    """Each call of learn has all the CPU seconds of the callback, from its own first step on."""
+    model = PPO("MlpPolicy", make_sb3_vec(2), n_steps=8, batch_size=16, device="cpu")
+    watch = EpisodeReturns(seconds=0.2)
+    for _ in range(2):
+        model.learn(10**9, callback=watch)
+        assert watch.elapsed >= 0.2
+        assert model.num_timesteps > 2  # two rows: more than one step

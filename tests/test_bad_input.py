@@ -20,6 +20,7 @@ import pytest
 
 import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.task import Task
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -734,6 +735,7 @@ import resource
 resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30, 3 * 2**30))
 import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.task import Task
 results = {}
 for path in sys.argv[1:]:
     for call in (mapp_env.Grid.load, lambda p: mapp_v0.parallel_env(grid=p)):
@@ -826,3 +828,71 @@ def test_what_is_not_an_environment_says_what_makes_one(slip: str) -> None:
     eval(said[1], names).close()
     with pytest.raises(AttributeError, match=r"module 'mapp_env' has no attribute 'maps'$"):
         _ = mapp_env.maps
+
+
+@pytest.mark.parametrize("face", ["parallel", "central", "tuple", "vector"])
+def test_a_refused_reset_changes_nothing(face: str) -> None:
+    """After a reset whose options are refused, seed and all, the next is as if it had not been."""
+    makers = {**FACES, "tuple": lambda: gymnasium.make("mapp_env/Tuple-v0")}
+    env, twin = (makers[face]() for _ in range(2))
+    for each in (env, twin):
+        each.reset(seed=1)
+    for options in ({"landmarks": [24, 0, 1, 2, 3]}, {"problem": 3}, 5):
+        with pytest.raises(ValueError, match="options"):
+            env.reset(seed=2, options=options)
+    for _ in range(2):
+        seen, expected = env.reset()[0], twin.reset()[0]
+        if face == "parallel":
+            seen, expected = seen["agent_0"], expected["agent_0"]
+        assert np.array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_a_refused_step_of_a_batch_changes_nothing(mode: str) -> None:
+    """After actions that are refused, also when rows have ended, the batch goes on as without."""
+    envs, twin = (
+        mapp_env.make_vec(3, max_cycles=2, autoreset_mode=mode, render_mode="ansi")
+        for _ in range(2)
+    )
+    for each in (envs, twin):
+        each.reset(seed=1)
+    actions = np.ones((3, 3), np.int64)
+    for step in range(2 if mode == "Disabled" else 5):
+        before = envs.render()
+        with pytest.raises(ValueError, match="actions"):
+            envs.step(actions + 3)
+        assert envs.render() == before
+        results = [each.step((actions + step) % 4)[:4] for each in (envs, twin)]
+        assert all(map(np.array_equal, *results))
+
+
+def test_memory_is_counted_in_bytes() -> None:
+    """A GiB of observations, or of distance fields, may be asked for, and no byte more."""
+    large = mapp_env.Grid(np.zeros((64, 65), bool))
+    for arguments, each in (
+        ({"grid": PAPER, "observation": "planes"}, 4 * 3 * 6 * 49),
+        ({"grid": PAPER, "observation": "own_first"}, 4 * 3 * 13),
+        ({"grid": PAPER}, 4 * 13),
+        ({"grid": large, "reward": "geodesic"}, 4 * 5 * 64 * 65),
+    ):
+        task = Task(**arguments)
+        most = (1 << 30) // each
+        task.check_memory(most)
+        with pytest.raises(ValueError, match="allowed are 1073741824"):
+            task.check_memory(most + 1)
+
+
+LETTERS = {"#": "wall", "@": "wall", "T": "wall", "O": "wall", ".": "free", "G": "free"}
+
+
+@pytest.mark.parametrize("header", [False, True])
+@pytest.mark.parametrize("letter", [*"#@TO.GSWXs"])
+def test_letters_of_maps(letter: str, header: bool) -> None:
+    """Each letter is a wall, free or refused; swamp and water are known below a header alone."""
+    text = ("type octile\nheight 1\nwidth 3\nmap\n" if header else "") + f"D.{letter}"
+    meaning = {**LETTERS, **({"S": "free", "W": "wall"} if header else {})}.get(letter)
+    if meaning is None:
+        with pytest.raises(ValueError, match="column 3"):
+            mapp_env.Grid.from_text(text)
+    else:
+        assert mapp_env.Grid.from_text(text).walls.tolist() == [[False, False, meaning == "wall"]]

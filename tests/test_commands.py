@@ -501,3 +501,68 @@ def test_commands_of_the_page_and_the_helps_work(
     for line, promise in re.findall(r"^mapp ([^\n]*)\n```\n\n```text\n(.*?)```", PAGE, re.M | re.S):
         seconds = r"\d+\.\d+ m?s"
         assert re.sub(seconds, "", outputs[line]) == re.sub(seconds, "", promise)
+
+
+# -- options have their effect -----------------------------------------------------------------
+
+
+def test_time_limit_and_seed_reach_the_search(capsys: pytest.CaptureFixture[str]) -> None:
+    """With next to no time the search's first plan is printed, and each seed has its own."""
+    grid = mapp_env.make_grid("warehouse")
+    cells = mapp_env.sample_problems(grid, 1, n_landmarks=40, seed=2)[0].tolist()
+    problem = mapp_env.Problem(grid, cells)
+    options = ["--grid", "warehouse", "--method", "search", "--landmarks", *map(str, cells)]
+    tours = []
+    for seed in (3, 4):
+        words = ["--time-limit", "1e-9", "--seed", str(seed)]
+        found = record(capsys, "solve", *options, *words)
+        plan = mapp_env.solve(problem, method="search", time_limit=1e-9, seed=seed)
+        assert found["tours"] == [list(tour) for tour in plan.tours]
+        tours.append(found["tours"])
+    assert tours[0] != tours[1]
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".GIF", ".Png"])
+def test_endings_are_of_any_case(
+    folder: Path, capsys: pytest.CaptureFixture[str], suffix: str
+) -> None:
+    """A picture's name may end in capitals."""
+    found = record(capsys, "render", "--out", f"a{suffix}", "--landmarks", "26")
+    assert found["bytes"] == (folder / f"a{suffix}").stat().st_size
+
+
+def test_a_policy_has_all_the_steps_asked_for(
+    folder: Path, capsys: pytest.CaptureFixture[str], loader: str
+) -> None:
+    """More steps than an environment's own limit are played, and all claims are counted."""
+    options = ["--policy", "3", "--policy-loader", loader, "--max-cycles", "60", "--out", "a.gif"]
+    cells = ["--landmarks", "25", "26", "0"]
+    assert "not solved: 2 of 3 landmarks" in printed(capsys, "render", *options, *cells)
+    with Image.open(folder / "a.gif") as image:
+        assert image.n_frames == 61
+
+
+def test_random_play_moves(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Random agents take the environment's four actions, all of them, and never wait."""
+    played = []
+    real = mapp_env.rendering.save_animation
+
+    def save(path: str, problem: mapp_env.Problem, actions: Any, fps: float) -> int:
+        played.append(np.array(actions))
+        return real(path, problem, actions, fps)
+
+    monkeypatch.setattr(mapp_env.rendering, "save_animation", save)
+    for seed in range(3):
+        options = ["--plan", "random", "--landmarks", *CELLS, "--seed", str(seed)]
+        assert main(["render", "--out", "a.gif", *options]) == 0
+    assert set(np.concatenate(played).ravel().tolist()) == {0, 1, 2, 3}
+
+
+def test_an_interruption_is_told_by_the_exit_status(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C ends a command with 130, as shells expect it."""
+
+    def interrupted(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solve, "problem_of", interrupted)
+    assert main(["solve"]) == 130

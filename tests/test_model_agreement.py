@@ -654,3 +654,27 @@ def test_landmark_option_takes_cells_and_pairs(as_pairs: bool) -> None:
     problem = mapp_env.Problem(mapp_env.make_grid("paper-7x7"), tuple(cells), n_agents=3)
     env.reset(options={"problem": problem})
     assert env.state()[3:8].tolist() == cells
+
+
+@pytest.mark.parametrize("face", ["parallel", "central", "vector"])
+def test_a_problems_limit_ends_with_its_episode(face: str) -> None:
+    """A problem without a limit has the environment's, whatever the one before it brought."""
+    grid = mapp_env.make_grid()
+    env: Any = {
+        "parallel": lambda: mapp_v0.parallel_env(max_cycles=6),
+        "central": lambda: gymnasium.make("mapp_env/Central-v0", max_cycles=6),
+        "vector": lambda: mapp_env.make_vec(2, max_cycles=6, autoreset_mode="Disabled"),
+    }[face]()
+    for limit, expected in ((3, 3), (None, 6), (9, 9), (None, 6)):
+        problem = mapp_env.Problem(grid, (0, 6, 20, 42, 48), 3, limit)
+        env.reset(options={"problem": problem})
+        steps, over = 0, False
+        while not over:
+            if face == "parallel":
+                env.step(dict.fromkeys(env.agents, 0))
+                over = not env.agents
+            else:
+                *_, truncated, _ = env.step(0 if face == "central" else np.zeros((2, 3), np.int64))
+                over = bool(np.all(truncated))
+            steps += 1
+        assert steps == expected

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapp_env import Grid, Plan, Problem, make_grid, replay, solve
+from mapp_env import Grid, Plan, Problem, make_grid, replay, sample_problems, solve
 from mapp_env.walking import walk_tours
 
 LINE = Problem(Grid.from_text("#D...#"), (2, 4), 2)  # cells 1 to 4 are free
@@ -223,3 +223,45 @@ def test_equal_plans_are_equal() -> None:
     assert first == second
     assert first.seconds > 0
     assert hash(first) == hash(second)
+
+
+@pytest.mark.parametrize("objective", ["cover_time", "makespan", "total_distance"])
+def test_who_waits_is_at_home(objective: str) -> None:
+    """With waiting an agent walks as recorded until it is home for good, and waits only there."""
+    rng = np.random.default_rng(5)
+    waited = 0
+    for landmarks in sample_problems(make_grid(), 30, seed=5).tolist():
+        problem = Problem(make_grid(), landmarks, int(rng.integers(1, 5)))
+        plan = solve(problem, objective)
+        actions = plan.joint_actions(allow_wait=True)
+        cells = np.full(problem.n_agents, problem.grid.depot)
+        moves = np.column_stack([problem.grid.moves, np.arange(problem.grid.n_cells)])
+        for step, joint in enumerate(actions):
+            assert (cells[joint == 4] == problem.grid.depot).all()
+            for agent in np.flatnonzero(joint == 4):
+                assert not plan.claim_steps[agent] or plan.claim_steps[agent][-1] <= step
+                assert (actions[step:, agent] == 4).all()
+            assert (np.array(plan.actions[step])[joint != 4] == joint[joint != 4]).all()
+            cells = moves[cells, joint]
+            waited += int((joint == 4).sum())
+        for agent, steps in enumerate(plan.claim_steps):
+            at_home = steps[-1] + problem.grid.home[plan.claims[agent][-1]] if steps else 0
+            assert (actions[at_home:, agent] == 4).all()
+    assert waited > 0
+
+
+def test_replay_ends_at_the_problems_limit() -> None:
+    """Exactly as many steps as the limit are carried out, and what lies beyond is left undone."""
+    for limit in (1, 2, 3, 4, None):
+        problem = Problem(LINE.grid, (4,), 1, limit)
+        plan = replay(problem, [[1]] * 5)
+        assert len(plan.actions) == min(limit or 5, 3)
+        assert plan.success == (len(plan.actions) == 3)
+
+
+def test_tours_that_leave_a_landmark_are_walked_to_their_end() -> None:
+    """Without a claim to wait for, the joint actions are as many as the longest tour has moves."""
+    tours = ((1, 2, 1), (1, 2, 3, 2, 1))
+    actions = walk_tours(LINE, tours)  # nobody comes to cell 4
+    assert actions.tolist() == [[1, 1], [0, 1], [0, 0], [0, 0]]
+    assert walk_tours(LINE, ((), ())).shape == (0, 2)

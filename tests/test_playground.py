@@ -5,6 +5,7 @@ Where there is no Chromium these tests are skipped, as the fixture ``browser`` s
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -506,3 +507,84 @@ def test_damaged_weights_are_said(damage, said, visit, tmp_path):
     assert said in page.inner_text("#alert")
     assert "export_playground.py" in page.inner_text("#alert")
     assert page.locator("button:enabled").count() == 0
+
+
+def test_a_miss_is_found_and_its_gap_told(visit):
+    """The problem that the page finds is one of a longer cover time; its gap is to the optimum."""
+    page = visit()
+    page.click("#miss")
+    said = "document.querySelector('#message').textContent.startsWith('Found after')"
+    page.wait_for_function(said, timeout=60_000)
+    landmarks = np.array([flags_of(page)])
+    plan, optimum = greedy_plans("pretrained", landmarks)[0], solve(Problem(GRID, landmarks[0]))
+    assert plan.cover_time > optimum.cover_time
+    shown = page.locator("#costs [data-cost=coverTime] td").all_inner_texts()
+    if plan.success:
+        assert shown[:2] == [str(plan.cover_time), str(optimum.cover_time)]
+        gap = 100 * (plan.cover_time - optimum.cover_time) / optimum.cover_time
+        assert float(shown[2].removesuffix(" %")) == pytest.approx(gap, abs=0.05)
+        assert page.inner_text("#verdict").startswith(f"Gap {shown[2]}: ")
+        assert page.get_attribute("#verdict", "data-kind") == "gap"
+
+
+def test_boards_follow_the_claims(visit):
+    """After each step just the flags that a plan has claimed by then are visited, and counted."""
+    page = visit("#0,6,20,42,48")
+    plans = {"network": greedy_plans("pretrained", np.array([FIRST]))[0]}
+    plans["optimum"] = solve(Problem(GRID, FIRST))
+    for step in range(1, max(plan.cover_time for plan in plans.values()) + 1):
+        page.fill("#time", str(step))
+        for name, plan in plans.items():
+            claims = dict(zip(sum(plan.claims, ()), sum(plan.claim_steps, ()), strict=True))
+            visited = [cell for cell in FIRST if claims[cell] <= step]
+            flags = page.locator(f"#{name}-board svg g.flag:has(path.cloth)")
+            shown = [" visited" in (flag.get_attribute("class") or "") for flag in flags.all()]
+            assert shown == [cell in visited for cell in FIRST]
+            labelled = page.locator(f"#{name}-board [data-cell][aria-label*='visited by agent']")
+            assert labelled.count() == len(visited)
+            note = page.inner_text(f"#{name}-note")
+            if len(visited) < 5:
+                assert note == f"{len(visited)} of 5 flags"
+            else:
+                assert note == f"all 5 flags at step {plan.cover_time}"
+
+
+ARROWS = """board => Array.from(document.querySelectorAll(`#${board}-board svg .arrow`), arrow => ({
+    agent: Number(arrow.parentNode.getAttribute("class").match(/agent-([0-9]+)/)[1]),
+    home: arrow.classList.contains("home"),
+    at: arrow.getAttribute("transform").match(/-?[0-9.]+/g).map(Number),
+}))"""
+
+
+def test_arrows_are_the_moves_of_the_tours(visit):
+    """Each move has an arrow to the right of its middle line, pale from the last claim on."""
+    page, plan = visit("#0,6,20,42,48"), solve(Problem(GRID, FIRST))
+    found = page.evaluate(ARROWS, "optimum")
+    for agent, (tour, claims) in enumerate(zip(plan.tours, plan.claims, strict=True)):
+        arrows = [arrow for arrow in found if arrow["agent"] == agent]
+        assert len(arrows) == max(len(tour) - 1, 0)
+        turn = tour.index(claims[-1]) if claims else 0
+        assert [arrow["home"] for arrow in arrows] == [move >= turn for move in range(len(arrows))]
+        for (start, end), arrow in zip(itertools.pairwise(tour), arrows, strict=True):
+            (down, across), (to_down, to_across) = divmod(start, 7), divmod(end, 7)
+            heading = (to_across - across, to_down - down)
+            x, y, _ = arrow["at"]
+            aside = (x - 100 * across - 50) * -heading[1] + (y - 100 * down - 50) * heading[0]
+            assert 0 < aside < 50
+
+
+def test_small_weights_are_read(visit, tmp_path):
+    """A weight below the least normal number of 16 bits is not taken for 0."""
+    run = make_policy(tmp_path / "run", {})
+    network = load_policy(run).network
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.mul_(2.0**-17)
+    save_policy(run / "policy.safetensors", network, half_precision=True)
+    page = visit(folder=page_with(export(str(run)), tmp_path / "page"))
+    seen = observations(20)
+    rows = [[row[:3], row[3:8], row[8:]] for row in seen.astype(int).tolist()]
+    with torch.no_grad():
+        expected = load_policy(run).network(torch.from_numpy(seen)).numpy()
+    assert np.abs(expected).max() > 0
+    np.testing.assert_allclose(page.evaluate(VALUES, rows), expected, rtol=1e-3, atol=1e-12)

@@ -512,3 +512,33 @@ def test_import_is_light() -> None:
         "print(sorted(heavy & set(sys.modules)))\n"
     )
     assert run_python("-c", code).splitlines() == ["[]", "[]"]
+
+
+def test_any_part_of_a_sample_is_fair() -> None:
+    """The first problems of a sample are no other than the last, also of nearly all there are."""
+    grid = mapp_env.make_grid("paper-7x7")
+    for n_problems in (60, 700):  # drawn one by one, and from a list of all 780
+        rows = mapp_env.sample_problems(grid, n_problems, n_landmarks=2, seed=4)
+        first, last = rows[: n_problems // 2].mean(), rows[n_problems // 2 :].mean()
+        assert abs(first - last) < 4
+
+
+def test_walls_are_the_callers() -> None:
+    """An array that a grid was made of stays writable, and writing into it changes no grid."""
+    walls = np.zeros((3, 4), bool)
+    grid = mapp_env.Grid(walls)
+    walls[:] = True
+    assert not grid.walls.any()
+    assert not grid.walls.flags.writeable
+
+
+def test_infos_are_each_agents_own() -> None:
+    """What one agent's wrapper writes into its info, metrics included, no other agent sees."""
+    env = mapp_v0.parallel_env(max_cycles=1)
+    env.reset(seed=0)
+    *_, infos = env.step(dict.fromkeys(env.agents, 0))
+    infos["agent_0"]["metrics"]["cover_time"] = -1.0
+    infos["agent_0"]["action_mask"][:] = 7
+    for agent in ("agent_1", "agent_2"):
+        assert infos[agent]["metrics"]["cover_time"] == np.inf
+        assert infos[agent]["action_mask"].max() == 1

@@ -540,3 +540,115 @@ def test_draw_plan_on_extreme_grids(rows: int, cols: int) -> None:
 def test_palette_is_written_as_hex() -> None:
     """Figures and frames name the same colour."""
     assert to_hex(agent_colour(0)) == "#0072b2"
+
+
+@pytest.mark.parametrize("face", ["parallel", "vector"])
+def test_pictures_know_this_episode_alone(face: str) -> None:
+    """A frame shows the trails of its own episode, from reset to last step, and its own limit."""
+    import mapp_env
+    from mapp_env import mapp_v0
+
+    problem = Problem(GRID, LANDMARKS, 3, max_cycles=7)
+    episodes = []
+    for mode in ("rgb_array", "ansi"):
+        if face == "parallel":
+            env: Any = mapp_v0.parallel_env(render_mode=mode)
+        else:
+            env = mapp_env.make_vec(1, render_mode=mode, autoreset_mode="Disabled")
+        for _ in range(2):
+            env.reset(options={"problem": problem})
+            pictures = [env.render()]
+            for step in range(7):
+                actions = np.array([1, 2, 3]) - step % 2
+                joint = (
+                    dict(zip(env.agents, actions.tolist(), strict=True))
+                    if (face == "parallel")
+                    else actions[None]
+                )
+                env.step(joint)
+                pictures.append(env.render())
+            episodes.append([p if face == "parallel" else p[0] for p in pictures])
+    first, second, *texts = episodes
+    assert all(map(np.array_equal, first, second))
+    assert [text.split("  ")[0] for text in texts[0]] == [f"step {step}/7" for step in range(8)]
+    # The frames are those of scenes that follow the same moves.
+    cells = [(24, 24, 24)]
+    for step in range(7):
+        cells.append(tuple(GRID.moves[list(cells[-1]), np.array([1, 2, 3]) - step % 2].tolist()))
+    for step, frame in enumerate(first):
+        scene = Scene(
+            grid=GRID,
+            landmarks=LANDMARKS,
+            visited=(False,) * 5,
+            cells=cells[step],
+            trails=tuple(zip(*cells[: step + 1], strict=True)),
+            step=step,
+            max_cycles=7,
+        )
+        assert np.array_equal(frame, rgb_array(scene))
+
+
+def test_trails_fade_with_age() -> None:
+    """The last move of a trail is drawn nearest to the agent's own colour, the first faintest."""
+    grid = Grid(np.zeros((1, 12), bool), 0)
+    trail = tuple(range(10))
+    scene = replace(start(grid, (), 1), cells=(11,), trails=(trail,))
+    frame = rgb_array(scene).astype(int)
+    side = 72
+    row = frame.shape[0] // 2 - 16  # above the bar, in the middle of the grid
+    left = (frame.shape[1] - 12 * side) // 2
+    band = frame[row - side // 2 : row + side // 2]
+    away = []
+    for move in range(9):
+        middle = left + (move + 1) * side - 8
+        column = band[:, middle]
+        away.append(int(np.abs(column - np.array(agent_colour(0))).sum(axis=1).min()))
+    assert away == sorted(away, reverse=True)
+    assert away[0] > away[-1]
+
+
+def test_unvisited_flags_are_seen_above_visited_ones() -> None:
+    """Where signs are larger than cells, a flag that is still to be visited is never hidden."""
+    grid = Grid(np.zeros((256, 256), bool), 0)
+    for visited in ((True, False), (False, True)):
+        cells = (128 * 256 + 128, 128 * 256 + 129)
+        scene = replace(start(grid, cells, 1), visited=visited)
+        alone = replace(start(grid, (cells[visited.index(False)],), 1))
+        frame, wanted = rgb_array(scene), rgb_array(alone)
+        red = (wanted == np.array(FLAG)).all(axis=-1)
+        assert red.any()
+        assert (frame[red] == np.array(FLAG)).all()
+
+
+def test_ansi_names_cells_by_row_and_column() -> None:
+    """Agents on one cell are named at its row and column, on grids of any shape."""
+    for rows, cols in ((2, 9), (9, 2)):
+        grid = Grid(np.zeros((rows, cols), bool), 0)
+        for cell in range(grid.n_cells):
+            row, col = divmod(cell, cols)
+            text = ansi(replace(start(grid, (), 2), cells=(cell, cell)))
+            assert text.endswith(f"& at row {row}, col {col}: agents 0, 1")
+            assert text.split("\n")[1 + row].split(" ")[col] == "&"
+
+
+def test_window_takes_the_frames_size(human: Any) -> None:
+    """A frame of another size than the one before is shown whole."""
+    import pygame
+
+    window = human.Window()
+    for height, width in ((40, 60), (80, 30), (64, 64)):
+        frame = np.random.default_rng(height).integers(0, 255, (height, width, 3), np.uint8)
+        window.show(frame, 0)
+        shown = pygame.surfarray.array3d(window._window.get_surface()).transpose(1, 0, 2)
+        assert np.array_equal(shown, frame)
+    window.close()
+
+
+def test_only_the_proven_cost_is_marked() -> None:
+    """Of a plan's three costs the title calls none optimal but the objective's."""
+    problem = Problem(GRID, LANDMARKS)
+    for objective in ("cover_time", "makespan", "total_distance"):
+        plan = plan_of(problem, [(0, 42), (6, 20, 48), ()], status="optimal", objective=objective)
+        title = draw_plan(problem, plan).get_title()
+        assert title.count("(optimal)") == 1
+        assert f"{objective.replace('_', ' ')} {plan.cost} (optimal)" in title

@@ -494,3 +494,22 @@ def test_batch_of_one_and_large_batch() -> None:
         assert batch.shape == venv.observation_space.shape == (n_rows, 8)
         assert infos["action_mask"].shape == (n_rows, 2, 4)
         venv.close()
+
+
+def test_infos_keep_nothing_of_the_callers_mask() -> None:
+    """Which rows were reset can be written over in the infos without touching what was passed."""
+    envs = mapp_env.make_vec(3)
+    envs.reset(seed=0)
+    mask = np.array([True, False, True])
+    _, infos = envs.reset(options={"reset_mask": mask})
+    infos["_action_mask"][:] = False
+    assert mask.tolist() == [True, False, True]
+
+
+def test_seed_0_of_a_row_is_a_seed() -> None:
+    """In a list of seeds 0 seeds its row as any other, also when rows were seeded before."""
+    envs = mapp_env.make_vec(2)
+    first = envs.reset(seed=[0, 1])[0]
+    envs.reset()
+    assert np.array_equal(envs.reset(seed=[0, 1])[0], first)
+    assert envs.np_random_seed == (0, 1)
