@@ -659,3 +659,162 @@ def test_what_is_not_refused_has_an_effect(name):
     kind, choice = changes.get(name, (META, {}))
     assert name not in without_effect(kind[0](**{**TINY, **choice}))
     assert outcome(kind, choice, **{name: OTHERS[name]}) != outcome(kind, choice)
+
+
+def small_training(preset, learner=MetaLearner, **changes):
+    """Return a training on the paper's grid that takes a moment."""
+    options = {
+        "n_problems": 2,
+        "episodes_per_problem": 3,
+        "max_cycles": 18,
+        "hidden_units": 8,
+        "code_units": 4,
+        "batch_size": 4,
+        "learning_starts": 10,
+        "prefetch": False,
+    }
+    args = preset_options(Args, preset, **{**options, **changes})
+    grid = make_grid("paper-7x7")
+    problems = np.array([[0, 6, 20, 42, 48], [1, 2, 3, 4, 5]])
+    return Training(args, grid, problems, learner(args, grid, Streams.spawn(args.seed)))
+
+
+def play_out(training):
+    """Return the rows of metrics.csv of a whole training."""
+    rows = []
+    while not training.finished:
+        row = training.advance()
+        rows += [] if row is None else [row]
+    return rows
+
+
+class Watched(MetaLearner):
+    """A learner that notes what it was told, and the losses that it returned."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.told, self.losses = [], []
+
+    def remember(self, observation, actions, *others):
+        """Keep what was seen and done."""
+        self.told.append((observation, np.array(actions)))
+        super().remember(observation, actions, *others)
+
+    def update(self, progress):
+        """Keep the loss."""
+        self.losses.append(super().update(progress))
+        return self.losses[-1]
+
+
+def test_guidance_falls_from_episode_to_episode():
+    """Within an episode the influence stays what its row says: 1 obeys always, 0 never."""
+    start = {"guidance_start": 1.0, "guidance_end": 0.0, "guidance_fraction": 0.1}
+    training = small_training("paper", Watched, epsilon_start=1.0, epsilon_end=1.0, **start)
+    rows, first = [], 0
+    pointed = obeyed = 0
+    while not training.finished:
+        row = training.advance()
+        if row is None:
+            continue
+        rows.append(row)
+        told = training.learner.told[first : first + row["steps"]]
+        first += row["steps"]
+        for seen, actions in told:
+            directions = training.guidance.directions(seen[None])[0]
+            close = directions != -1
+            if row["guidance"] == 1.0:
+                assert (actions[close] == directions[close]).all()
+            else:
+                pointed += int(close.sum())
+                obeyed += int((actions[close] == directions[close]).sum())
+    assert [row["guidance"] for row in rows] == [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    assert 0 < obeyed < pointed / 2  # by chance
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_rows_tell_problem_and_mean_loss(preset):
+    """Problems count from 1, and a row's loss is the mean of the losses of its updates."""
+    training = small_training(preset, Watched)
+    first = 0
+    rows = []
+    while not training.finished:
+        row = training.advance()
+        if row is not None:
+            losses = training.learner.losses[first : first + row["updates"]]
+            first += row["updates"]
+            assert row["loss"] == (pytest.approx(np.mean(losses)) if losses else "")
+            rows.append(row)
+    assert first == len(training.learner.losses) > 0
+    assert [row["problem"] for row in rows] == [1, 1, 1, 2, 2, 2]
+
+
+def test_every_source_of_chance_has_a_stream_of_its_own():
+    """Problems, exploration, batches and start weights draw different numbers, for each seed."""
+    firsts = set()
+    for seed in range(3):
+        training = small_training("default", seed=seed)
+        streams = Streams.spawn(seed)
+        generators = (training.rng, training.learner.rng, np.random.default_rng(streams.problems))
+        firsts |= {str(generator.bit_generator.state["state"]) for generator in generators}
+        firsts.add(str(np.random.default_rng(streams.network).bit_generator.state["state"]))
+    assert len(firsts) == 12
+
+
+@pytest.mark.parametrize("n_added", [1, 3, 5, 8])
+def test_every_kept_transition_is_drawn(n_added):
+    """Batches hold all that is kept, the newest and the oldest too, and a copy goes on alike."""
+    memory = ReplayMemory(5, 1, 1)
+    for index in range(n_added):
+        memory.add(np.array([index]), np.array([0]), 0.0, np.array([index + 1]), False)
+    drawn = memory.sample(400, np.random.default_rng(0)).observations[:, 0]
+    kept = set(range(max(n_added - 5, 0), n_added))
+    assert set(drawn.tolist()) == kept
+    copied = ReplayMemory(5, 1, 1)
+    copied.restore({name: array.copy() for name, array in memory.arrays_by_name().items()})
+    for each in (memory, copied):
+        each.add(np.array([99]), np.array([0]), 0.0, np.array([100]), False)
+    for name, array in memory.arrays_by_name().items():
+        np.testing.assert_array_equal(copied.arrays_by_name()[name], array)
+
+
+def test_the_first_update_moves_the_weights():
+    """With a warm-up the step size rises from a first step that is not 0."""
+    learner = small_training("default", learning_rate_warmup=10).learner
+    rates = []
+    grid = make_grid("paper-7x7")
+    rng, cells = np.random.default_rng(0), np.full(3, grid.depot)
+    for _ in range(200):
+        actions = rng.integers(4, size=3)
+        there = np.asarray(grid.moves)[cells, actions]
+        before, after = (
+            np.array([*c, 0, 1, 2, 3, 4, *[0] * 5], np.float32) for c in (cells, there)
+        )
+        learner.remember(before, actions, -1.0, after, False)
+        cells = there
+    before = [weights.detach().clone() for weights in learner.weights]
+    for _ in range(12):
+        learner.update(0.0)
+        rates.append(learner.optimiser.param_groups[0]["lr"])
+        if len(rates) == 1:
+            assert any(not torch.equal(a, b) for a, b in zip(before, learner.weights, strict=True))
+    rate = learner.args.learning_rate
+    np.testing.assert_allclose(rates, [rate * min(1, (i + 1) / 10) for i in range(12)])
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_double_dqn_asks_the_network_as_it_is(double):
+    """Batches are prepared ahead where only the target network is asked, and not with double."""
+    training = small_training("default", double=double, updates_per_episode=3)
+    play_out(training)
+    assert training.learner.updates > 0
+    assert (training.learner.prepared is None) == double
+
+
+@pytest.mark.parametrize("final_from", [0.0, 0.5, 1.0])
+def test_the_goal_changes_at_the_very_part(final_from):
+    """From `final_from` on, itself included, transitions are rewarded with the final reward."""
+    learner = small_training("default", final_from=final_from).learner
+    first, last = learner.goals
+    assert first is not last
+    for progress in (0.0, 0.25, 0.499, 0.5, 0.75, 1.0):
+        assert learner.goal(progress) is (last if progress >= final_from else first)

@@ -390,3 +390,50 @@ def test_weights_without_a_team_are_of_one_network(tmp_path):
     content = safetensors.torch.save(network.state_dict(), {WEIGHTS_KEY: json.dumps(about)})
     (tmp_path / "w").write_bytes(content)
     assert load_policy(tmp_path / "w").spec == spec
+
+
+@pytest.mark.parametrize("as_far", [0.0, 0.2, 1.0])
+def test_share_of_fresh_landmarks_visited_as_far(as_far):
+    """As many are visited as were in just that share of what is drawn; else any number may be."""
+    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    replay = RelabelledReplay(spec, GRID.depot, 400, fresh=1.0, as_far=as_far)
+    moves = np.asarray(GRID.moves)
+    rng, cells = np.random.default_rng(0), np.full(3, GRID.depot)
+    marks = [0, 1, 2, 3, 4, 0, 0, 0, 0, 0]  # nothing was ever visited
+    for _ in range(400):
+        actions = rng.integers(4, size=3)
+        there = moves[cells, actions]
+        before, after = (np.array([*c, *marks], np.float32) for c in (cells, there))
+        replay.remember(before, actions[0], after)
+        cells = there
+    batch = replay.draw(4000, RelabelledReward(np.zeros((0, 0), np.float32), 1.0), rng)
+    seen = batch.observations
+    on = (seen[:, None, :3] == seen[:, 3:8, None]).any(axis=2)
+    more = (seen[:, 8:] > on).any(axis=1)  # visited, though nobody stands on it
+    assert more.mean() == pytest.approx((1 - as_far) * 0.8, abs=0.05)
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("share", [False, True])
+def test_as_much_is_kept_of_each_agent(preset, share):
+    """However parameters are shared, so many transitions of every agent are kept."""
+    team = make(preset, share_parameters=share, memory_size=50)
+    for transition in walk(np.random.default_rng(0), 80):
+        team.remember(*transition)
+    capacities = []
+    for learner in team.learners:
+        memory = getattr(learner.replay, "memory", learner.replay)
+        capacities.append(len(memory))
+    assert sum(capacities) == 150
+    assert len(set(capacities)) == 1
+
+
+def test_shared_transitions_lead_to_the_same_agents_view():
+    """What an agent sees after its move is told from its own place, too."""
+    team = make("default", share_parameters=True)
+    transition = next(walk(np.random.default_rng(3), 1))
+    team.remember(*transition)
+    memory = team.learners[0].replay.memory
+    for agent in range(3):
+        expected = view(transition[3], agent, team.spec)
+        np.testing.assert_array_equal(memory.arrays.next_observations[agent, 0], expected)
