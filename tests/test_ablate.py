@@ -9,6 +9,8 @@ import torch
 from baselines import ablate, meta_dqn
 from baselines.ablate import VARIANTS, Args
 from baselines.options import parse_options
+from baselines.training import Streams
+from mapp_env import make_grid
 
 WORDS = [
     *("--n-problems", "1", "--episodes-per-problem", "4", "--max-cycles", "15"),
@@ -51,3 +53,33 @@ def test_no_unknown_or_double_variants(variants):
     """What cannot be compared is refused by name."""
     with pytest.raises(ValueError, match=r"^variants must be"):
         Args(variants=variants)
+
+
+def test_variants_are_what_they_are_called():
+    """Each variant changes what its name says, to what it says."""
+    learners = {}
+    for variant, words in VARIANTS.items():
+        more = ("--hidden-units", "8", "--code-units", "4", "--batch-size", "4", "--no-prefetch")
+        args = parse_options(meta_dqn.Args, "", [*more, *words])
+        learners[variant] = meta_dqn.MetaLearner(args, make_grid(), Streams.spawn(0))
+    rewards = {
+        variant: [
+            "step" if learner.goal(progress).reward.distances.size == 0 else "manhattan"
+            for progress in (0.0, 0.5, 1.0)
+        ]
+        for variant, learner in learners.items()
+        if learner.goals
+    }
+    assert rewards.pop("-1 a step alone") == ["step"] * 3
+    assert rewards.pop("paper's reward alone") == ["manhattan"] * 3
+    assert set(map(tuple, rewards.values())) == {("manhattan", "step", "step")}
+    assert learners["plain numbers"].spec.kind == "paper"
+    assert learners["12 outputs"].spec.values_shape == (3, 4)
+    assert learners["replay as played"].imagined is None
+    assert learners["one action a state"].imagined.n_tried == 1
+    assert learners["no wider action gap"].args.action_gap == 0
+    assert learners["no retries"].imagined.retries == 0
+    assert learners["double DQN"].args.double
+    assert not learners["no dueling"].spec.dueling
+    assert not learners["constant step size"].args.learning_rate_falls
+    assert learners["guidance"].args.guidance_start == 1

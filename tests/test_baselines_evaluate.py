@@ -422,3 +422,17 @@ def test_options_without_effect_are_refused(options, said):
     with pytest.raises(ValueError, match=said):
         script.Args("pretrained", **options)
     script.Args("nearest", guidance=0.5, **options)
+
+
+def test_a_problem_is_seen_once():
+    """Problems that were trained on twice, or in another order, count once."""
+    total = count_unseen(PAPER, [])
+    once = [(0, 6, 20, 42, 48), (1, 2, 3, 4, 5)]
+    assert count_unseen(PAPER, [*once, *once, (48, 42, 20, 6, 0)]) == total - 2
+
+
+@pytest.mark.parametrize("name", ["solved %", "optimal %"])
+def test_no_share_says_all_where_one_is_missing(name):
+    """A share is shown as 100 only if it is."""
+    assert evaluation_module._format_cell(name, 99.9999) == "99.99"
+    assert evaluation_module._format_cell(name, 100.0) == "100.00"

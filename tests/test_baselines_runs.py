@@ -13,11 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
+import torch
 import tyro
+from matplotlib.figure import Figure
 
 import mapp_env
-from baselines import evaluate, experiment, meta_dqn
+from baselines import evaluate, experiment, figures, meta_dqn, runs
 from baselines.figures import draw_learning_curves
+from baselines.guidance import GuidedPolicy
 from baselines.options import preset_options
 from baselines.policy import load_policy
 from baselines.runs import RunFolder, describe_environment, read_config, read_metrics
@@ -437,3 +441,105 @@ def test_bad_window_on_the_command_line_is_an_error(two_runs):
     assert output == ""
     assert errors.startswith("error: window must be a whole number from 1 ")
     assert errors.count("\n") == 1
+
+
+def test_commit_says_whether_the_code_was_changed(tmp_path, monkeypatch):
+    """config.json names the commit, and whether anything was edited since."""
+
+    def git(*words):
+        identity = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        command = ["git", *identity, *words]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    git("init", "-q")
+    (tmp_path / "code.py").write_text("1\n")
+    git("add", "code.py")
+    git("commit", "-q", "-m", "first")
+    monkeypatch.setattr(runs, "__file__", str(tmp_path / "code.py"))
+    assert runs.git_commit() == git("rev-parse", "HEAD")
+    (tmp_path / "code.py").write_text("2\n")
+    assert runs.git_commit() == git("rev-parse", "HEAD") + "+changes"
+
+
+def test_signals_are_as_before_afterwards():
+    """Whoever trains as part of a larger program has its own handlers of signals back."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with runs.StopSignals():
+        assert all(signal.getsignal(number) != own for number, own in handlers.items())
+    assert {number: signal.getsignal(number) for number in handlers} == handlers
+
+
+def test_an_empty_field_is_no_number(tmp_path):
+    """An episode without an update has no loss, which is not a loss of 0."""
+    (tmp_path / "metrics.csv").write_text("episode,loss\n1,\n2,0.5\n")
+    metrics = read_metrics(tmp_path)
+    assert np.isnan(metrics["loss"][0])
+    assert metrics["loss"][1] == 0.5
+
+
+def test_a_folder_without_a_run_is_not_resumed(tmp_path):
+    """Where there is no config nothing is made, and the folder is named."""
+    (tmp_path / "metrics.csv").write_text("mine\n")
+    with pytest.raises(ValueError, match=r"resume must be a run folder|config\.json"):
+        RunFolder(tmp_path, ["a"], resume=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
+    assert (tmp_path / "metrics.csv").read_text() == "mine\n"
+
+
+SQUARE = "D..\n...\n...\n"
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_rows_of_the_table(tmp_path, monkeypatch, preset):
+    """Evaluated are problems that were not trained on, each rival as its row says."""
+    (tmp_path / "square.txt").write_text(SQUARE)
+    options = {"grid": str(tmp_path / "square.txt"), "n_agents": 2, "n_landmarks": 1}
+    small = {"hidden_units": 8, "learning_starts": 5, "batch_size": 4, "max_cycles": 10}
+    counts = {"n_problems": 4, "episodes_per_problem": 1, "evaluation_problems": 4}
+    played = {}
+    real = experiment.evaluate
+
+    def evaluated(policy, setting, problems, *others, **more):
+        played[more["progress"]] = policy, problems
+        return real(policy, setting, problems, *others, **more)
+
+    monkeypatch.setattr(experiment, "evaluate", evaluated)
+    args = preset_options(
+        meta_dqn.Args,
+        preset,
+        **options,
+        **small,
+        **counts,
+        half_precision=True,
+        out=tmp_path / "run",
+    )
+    assert meta_dqn.main(args) == 0
+    trained = {row[0] for row in read_config(args.out)["training_problems"]}
+    assert len(trained) == 4
+    for _, problems in played.values():
+        assert {row[0] for row in problems.tolist()} == set(range(1, 9)) - trained
+    influences = {
+        label: policy.influence
+        for label, (policy, _) in played.items()
+        if isinstance(policy, GuidedPolicy)
+    }
+    guided = {"network, guidance 0.1": 0.1, "network, guidance 1": 1.0, "random, guidance 1": 1.0}
+    assert influences == (guided if preset == "paper" else {})
+    kept = safetensors.torch.load_file(args.out / "policy.safetensors")
+    assert {weights.dtype for weights in kept.values()} == {torch.float16}
+
+
+def test_running_mean_ends_with_its_last_episode():
+    """The mean of the last so many episodes is drawn at the last of them; lines part problems."""
+    figure = Figure()
+    axes = figure.add_subplot()
+    values = np.arange(10.0) ** 2
+    figures._draw_curve(axes, range(1, 11), values, [1] * 4 + [2] * 6, 3)
+    lines = {line.get_label(): line for line in axes.lines}
+    mean = lines["mean of the last 3"]
+    assert list(mean.get_xdata()) == list(range(3, 11))
+    expected = [values[i - 2 : i + 1].mean() for i in range(2, 10)]
+    assert mean.get_ydata() == pytest.approx(expected)
+    upright = [line for line in axes.lines if len(set(line.get_xdata())) == 1]
+    assert [line.get_xdata()[0] for line in upright if len(line.get_xdata())] == [4.5]

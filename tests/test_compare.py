@@ -4,6 +4,7 @@ import csv
 import os
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torch
 from filelock import FileLock
 from scipy import stats
 
-from baselines import compare, experiment, independent_dqn, meta_dqn, studies
+from baselines import compare, experiment, figures, independent_dqn, meta_dqn, studies
 from baselines.compare import Args
 from baselines.options import parse_options
 from baselines.studies import MEASURES, Interval, format_interval, interval
@@ -264,3 +265,91 @@ def test_every_learner_takes_the_presets():
             assert options.preset == preset
             assert getattr(options, "share_parameters", False) == bool(own)
     assert meta_dqn.ALGORITHM != independent_dqn.ALGORITHM
+
+
+# -- what is read, and what is drawn -----------------------------------------------------------
+
+
+def finished_trial(out, seed, solved, learner="meta"):
+    """Return a trial with files as if it had been trained for 150 episodes and evaluated."""
+    args = tiny(out / f"{learner}{seed}", learners=(learner,), seeds=seed + 1)
+    trials = compare.plan_trials(args, WORDS)
+    trial = next(trial for trial in trials if trial.seed == seed)
+    trial.folder.mkdir(parents=True)
+    header = "policy,problems,solved %,gap %,optimal %,unsolved = 15\n"
+    gap = "nan" if solved == 0 else "8.0"
+    (trial.folder / "evaluation.csv").write_text(
+        f"{header}nearest landmark,30,100,1,2,3\nnetwork alone,30,{solved},{gap},1.5,{9 + seed}\n"
+    )
+    (trial.folder / "timing.json").write_text('{"seconds_total": 90.0}')
+    rows = [f"{i + 1},1,15,{-i},{i % 2},1,0,0," for i in range(150)]
+    text = "episode,problem,steps,reward,solved,epsilon,guidance,updates,loss\n"
+    (trial.folder / "metrics.csv").write_text(text + "\n".join(rows) + "\n")
+    return trial
+
+
+def test_an_outcome_is_what_the_files_say(tmp_path):
+    """Figures are those of the network alone, the return that of the last hundred episodes."""
+    outcome = studies.read_outcome(finished_trial(tmp_path, 0, 50.0))
+    assert outcome.measures == {
+        "solved %": 50.0,
+        "gap %": 8.0,
+        "optimal %": 1.5,
+        "cover time": 9.0,
+        "return": -np.arange(50, 150).mean(),
+        "minutes": 1.5,
+    }
+    assert outcome.returns.tolist() == [-float(i) for i in range(150)]
+
+
+def test_who_solves_nothing_has_no_gap(tmp_path):
+    """The gap is summed up over those that have one, and it is said of how many."""
+    outcomes = [
+        studies.read_outcome(finished_trial(tmp_path, seed, solved))
+        for seed, solved in enumerate((0.0, 50.0, 70.0))
+    ]
+    (summary,) = studies.summarise(outcomes)
+    assert summary.measures["gap %"].n == 2
+    assert summary.measures["gap %"].mean == 8.0
+    assert summary.measures["solved %"].n == 3
+    assert "8.00 [8.00, 8.00] (2 of 3)" in studies.format_study(compare.COLUMNS, [summary])
+
+
+def test_interval_is_the_interquartile_means():
+    """One value far out moves neither the mean nor its interval."""
+    values = np.random.default_rng(0).normal(size=40)
+    values[0] = 1e6
+    found = interval(values)
+    assert -1 < found.low < found.mean < found.high < 1
+
+
+def test_all_learners_have_the_updates_asked_for(tmp_path):
+    """The budget of the default preset is the same for every learner."""
+    args = tiny(tmp_path, presets=("default",), learners=tuple(compare.LEARNERS), seeds=1)
+    for default_updates in (7, 32):
+        trials = compare.plan_trials(replace(args, default_updates=default_updates), [])
+        assert [trial.group[1] for trial in trials] == list(compare.LEARNERS)
+        assert {t.options.updates_per_episode for t in trials} == {default_updates}
+
+
+def test_curves_are_those_of_the_episodes(tmp_path, monkeypatch):
+    """Drawn are running means over the seeds, at the episodes that they end with, in per cent."""
+    outcomes = [
+        studies.read_outcome(finished_trial(tmp_path, seed, 50.0, learner))
+        for learner in ("meta", "shared")
+        for seed in (0, 1)
+    ]
+    drawn = []
+    monkeypatch.setattr(figures, "_save", lambda figure, path: drawn.append(figure) or path)
+    compare.draw(tmp_path, studies.summarise(outcomes))
+    returns, solved, shares, gaps = drawn[0].axes
+    for axes in (returns, solved):
+        assert [line.get_label() for line in axes.lines] == ["meta", "shared"]
+    for line in returns.lines:
+        assert line.get_xdata().tolist() == list(range(30, 151))
+        assert line.get_ydata()[0] == pytest.approx(-np.arange(30).mean())
+        assert line.get_ydata()[-1] == pytest.approx(-np.arange(120, 150).mean())
+    for line in solved.lines:
+        assert line.get_ydata() == pytest.approx(np.full(121, 50.0))
+    assert {float(x) for line in shares.lines for x in np.ravel(line.get_xdata())} == {50.0}
+    assert {float(x) for line in gaps.lines for x in np.ravel(line.get_xdata())} == {8.0}
