@@ -566,3 +566,15 @@ def test_an_interruption_is_told_by_the_exit_status(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(solve, "problem_of", interrupted)
     assert main(["solve"]) == 130
+
+
+@pytest.mark.parametrize("name", ["maze", "random", "rooms", "warehouse"])
+def test_generated_grids_have_the_rows_and_columns_asked_for(
+    capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    """--rows and --cols mean what they say, and --grid-seed says which grid of that size."""
+    for seed in ("0", "1"):
+        sides = ["--rows", "6", "--cols", "9", "--grid-seed", seed]
+        found = record(capsys, "universe", "--grid", name, *sides, "--n-landmarks", "1")
+        grid = mapp_env.make_grid(name, rows=6, cols=9, seed=int(seed))
+        assert found["grid"] == grid.to_text()

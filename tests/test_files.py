@@ -745,3 +745,16 @@ def test_vrplib_fields_survive_a_reader_that_knows_tsplib_alone(tmp_path: Path) 
         "EDGE_WEIGHT_TYPE": "EXPLICIT",
         "EDGE_WEIGHT_FORMAT": "FULL_MATRIX",
     }
+
+
+@pytest.mark.parametrize("n_agents", [1, 3])
+def test_a_vehicle_has_room_for_all(tmp_path: Path, n_agents: int) -> None:
+    """In VRPLIB's format no capacity keeps one vehicle from visiting every landmark."""
+    problem = Problem(make_grid(), (0, 6, 20, 42, 48), n_agents)
+    mapp_env.solvers.save_vrplib(problem, tmp_path / "a.vrp")
+    lines = (tmp_path / "a.vrp").read_text().splitlines()
+    (capacity,) = (int(line.split(":")[1]) for line in lines if line.startswith("CAPACITY"))
+    start, end = lines.index("DEMAND_SECTION"), lines.index("DEPOT_SECTION")
+    demands = [int(line.split()[1]) for line in lines[start + 1 : end]]
+    assert demands == [0, 1, 1, 1, 1, 1]
+    assert capacity >= sum(demands)

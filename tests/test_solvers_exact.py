@@ -609,3 +609,43 @@ def test_compiling_is_not_counted(method: str, tmp_path: Path) -> None:
     assert seen[-2:] == ["clock", "clock"]
     assert len(seen) > 2
     assert set(seen[:-2]) == {"compiler"}
+
+
+def test_auto_proves_what_there_is_time_for() -> None:
+    """Up to 20 landmarks are proven, 16 where less than two seconds may pass; beyond, searched."""
+    grid = mapp_env.make_grid()
+    cells = mapp_env.sample_problems(grid, 1, n_landmarks=18, seed=1)[0].tolist()
+    problem = Problem(grid, cells)
+    assert solve(problem, time_limit=2.0).solver == "exact"
+    assert solve(problem).solver == "exact"
+    assert solve(problem, time_limit=1e-3).solver == "search"
+    assert solve(Problem(grid, cells[:16]), time_limit=1e-3).solver == "exact"
+
+
+def test_universe_names_cells_of_any_grid() -> None:
+    """Landmarks are the cells themselves, in 16 bits where these have room for all."""
+    for cols, kind in ((63, np.int16), (64, np.int32), (128, np.int32)):
+        walls = np.ones((512, cols), bool)
+        walls[-1, -4:] = False
+        grid = Grid(walls)
+        landmarks, optimum = solve_universe(grid, 2, 1)
+        assert landmarks.dtype == kind
+        assert landmarks.tolist() == list(map(list, itertools.combinations(grid.reachable, 2)))
+        assert landmarks.min() > 0
+        assert len(optimum) == 3
+
+
+def test_tours_run_in_the_faster_direction() -> None:
+    """Of equally short tours the one that is through with its landmarks first is taken."""
+    rng = np.random.default_rng(8)
+    slower = 0
+    for _ in range(40):
+        problem = random_problem(rng, 5, 1)
+        plan = solve(problem, "total_distance")
+        (tour,) = plan.tours
+        marks = set(problem.landmarks)
+        last = max(tour.index(cell) for cell in marks)
+        back = tour[::-1]
+        assert plan.cover_time == last <= max(back.index(cell) for cell in marks)
+        slower += last < max(back.index(cell) for cell in marks)
+    assert slower > 10
