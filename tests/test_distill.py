@@ -262,3 +262,44 @@ def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
     assert distill.main(distill.Args(resume=tmp_path / "run")) == 0
     for name in ("metrics.csv", "policy.safetensors"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_too_many_mistakes_forget_the_oldest(monkeypatch):
+    """Where more answers are wrong than may wait, those that have waited longest are dropped."""
+    monkeypatch.setattr(distill, "MAX_MISTAKES", 30)
+    pupil = distill.Distilled(distill.Args(**{**SMALL, "asked_again": 5}), make_grid())
+    pupil.lesson()
+    for _ in range(3):
+        waiting = pupil.mistakes.copy()
+        assert len(waiting) == 30
+        pupil.lesson()
+        # Of a batch of 64 more than 30 answers are wrong, so that all that waits is new.
+        old = {tuple(row) for row in waiting[5:].tolist()}
+        assert sum(tuple(row) in old for row in pupil.mistakes.tolist()) < 5
+
+
+def test_the_last_update_still_teaches():
+    """The step size falls in a straight line, and reaches 0 only when all updates are done."""
+    pupil = distill.Distilled(distill.Args(**SMALL, updates=4, learning_rate=0.5), make_grid())
+    for _ in range(4):
+        before = [weights.detach().clone() for weights in pupil.network.parameters()]
+        pupil.update()
+        after = pupil.network.parameters()
+        assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("half_precision", [False, True])
+def test_a_run_starts_with_its_policys_own_weights(tmp_path, monkeypatch, half_precision):
+    """What it may have to start from again is kept to the bit, however the end is kept."""
+    kept = []
+
+    def noted(pupil, run, *others):
+        start = load_policy(run.folder).network.state_dict()
+        kept.append([torch.equal(start[k], v) for k, v in pupil.network.state_dict().items()])
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(imitation, "train", noted)
+    args = distill.Args(out=tmp_path / "run", half_precision=half_precision, **SMALL)
+    with pytest.raises(ZeroDivisionError):
+        distill.main(args)
+    assert all(kept[0])

@@ -185,3 +185,25 @@ def test_what_cannot_be_mended_is_refused():
     for name in ("attempts", "surveyed", "updates_per_survey", "taught_batch"):
         with pytest.raises(ValueError, match=f"^{name} must be"):
             Args(**{name: 0})
+
+
+@pytest.mark.parametrize("half_precision", [False, True])
+def test_surveyed_is_what_will_be_kept(folder, monkeypatch, half_precision):
+    """The problems that are mended are those that the kept weights, rounded or not, leave."""
+    network = load_policy(folder).network
+    with torch.no_grad():
+        for weights in network.head.parameters():
+            weights.add_(torch.linspace(0, 1e-4, weights.numel()).view(weights.shape))
+    expected = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    if half_precision:
+        expected = {name: tensor.half().float() for name, tensor in expected.items()}
+    played = []
+
+    def noted(policy, setting, problems):
+        played.append(policy.network.state_dict())
+        return evaluate(policy, setting, problems)
+
+    monkeypatch.setattr(repair, "evaluate", noted)
+    args = Args(**{**SMALL, "surveyed": 10, "attempts": 3}, half_precision=half_precision)
+    Repaired(args, SETTING, network).survey()
+    assert all(torch.equal(played[0][name], tensor) for name, tensor in expected.items())

@@ -290,3 +290,40 @@ def test_a_run_needs_nothing_but_its_folder(folder, tmp_path, monkeypatch):
     (tmp_path / "train" / "checkpoints" / "000000000020.safetensors").write_bytes(b"damaged")
     with pytest.raises(ValueError, match="checkpoint"):
         self_improve.main(Args(resume=tmp_path / "train"))
+
+
+def test_what_no_episode_solves_comes_again(monkeypatch):
+    """Problems that were given up, and those with a shorter episode, come again; others do not."""
+    args = Args(**{**SMALL, "problems": 3, "played_again": 3, "episodes": 2, "max_length": 6})
+    pupil = SelfImproved(args, SETTING, untrained())
+    played = []
+    seen, joint = np.zeros((7, 6, 6), np.float32), np.zeros((7, 6), np.int64)
+
+    def episodes(landmarks):
+        played.append(landmarks[::2].tolist())
+        return seen, joint, np.array([7, 7, 3, 3, 4, 2])
+
+    monkeypatch.setattr(pupil, "episodes", episodes)
+    monkeypatch.setattr(pupil, "as_good", lambda *_: Lessons.of(0, pupil.spec))
+    pupil.play()
+    assert pupil.again.tolist() == [played[0][0], played[0][2]]
+
+
+def test_the_table_is_over_problems_never_trained_on(folder, tmp_path, monkeypatch):
+    """What the policy was trained on to begin with is none of the problems evaluated."""
+    config = json.loads((folder / "config.json").read_text())
+    rows = GRID.reachable.tolist()
+    config["training_problems"] = [[a, b] for a in rows[:6] for b in rows if a < b]
+    (folder / "config.json").write_text(json.dumps(config))
+    seen = {tuple(sorted(row)) for row in config["training_problems"]}
+    played = []
+
+    def noted(policy, setting, problems, *others):
+        played.append({tuple(row) for row in problems.tolist()})
+        return evaluate(policy, setting, problems, *others)
+
+    monkeypatch.setattr(imitation, "evaluate", noted)
+    options = {**SMALL, "evaluation_problems": 10, "updates": 2}
+    assert self_improve.main(Args(policy=str(folder), out=tmp_path / "run", **options)) == 0
+    assert len(played[0]) == 10
+    assert not played[0] & seen

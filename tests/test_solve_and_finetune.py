@@ -202,3 +202,37 @@ def test_what_cannot_be_solved_is_refused(folder):
         solve.main(solve.Args((CELLS[0], wall), str(folder)))
     with pytest.raises(ValueError, match="path must be a run folder or a weights file"):
         solve.main(solve.Args(CELLS, "nonsense"))
+
+
+def test_patience_begins_after_the_random_episodes(monkeypatch):
+    """Only episodes played after training count as waiting, however long the random ones are."""
+    problem = solve.make_problem(SETTING, CELLS)
+    optimum = mapp_env.solve(problem)
+    monkeypatch.setattr(finetune, "play", lambda env, tuner, random: optimum)
+    monkeypatch.setattr(finetune.Tuner, "train", lambda tuner: None)
+    for random_episodes, patience in ((0, 1), (2, 1), (5, 3)):
+        args = finetune.Args(
+            landmarks=CELLS, random_episodes=random_episodes, patience=patience, episodes=20
+        )
+        _, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
+        assert n_episodes == 1 + random_episodes + patience
+
+
+def test_a_searchs_best_is_not_called_the_optimum(folder, capsys):
+    """Only what is proven is reported as the optimum, and only to that there is a gap."""
+    problem = solve.make_problem(SETTING, CELLS)
+    best = mapp_env.solve(problem)
+    for optimum, label in ((best, "optimum:"), (replace(best, status="feasible"), "best known:")):
+        solve.report(problem, {"policy": best}, optimum)
+        lines = capsys.readouterr().out.splitlines()
+        assert ("gap" in lines[0]) == (label == "optimum:")
+        assert lines[1].startswith(label)
+
+
+def test_the_exit_code_tells_whether_it_is_solved(folder, monkeypatch):
+    """0 for a policy that visits all, 1 for one that does not."""
+    problem = solve.make_problem(SETTING, CELLS)
+    plans = {0: mapp_env.solve(problem), 1: replay(problem, [[0, 0]])}
+    for code, plan in plans.items():
+        monkeypatch.setattr(solve, "solve_by_policy", lambda *_, plan=plan: plan)
+        assert solve.main(solve.Args(CELLS, str(folder))) == code
