@@ -292,3 +292,14 @@ def test_too_long_an_episode_is_refused_at_its_first_frame(
     with pytest.raises(ValueError, match="got 2001"):
         save_animation(tmp_path / "a.gif", problem, actions, max_side=16)
     assert len(drawn) == 1
+
+
+def test_two_thousand_frames_are_allowed(tmp_path: Path) -> None:
+    """The largest number of frames is written, one more is not."""
+    frames = np.zeros((2001, 2, 2, 3), np.uint8)
+    frames[::2] = 255
+    save_gif(tmp_path / "a.gif", frames[:2000], fps=50, hold=0)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 2000
+    with pytest.raises(ValueError, match="may have 2000 frames"):
+        save_gif(tmp_path / "b.gif", frames)

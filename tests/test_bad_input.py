@@ -896,3 +896,21 @@ def test_letters_of_maps(letter: str, header: bool) -> None:
             mapp_env.Grid.from_text(text)
     else:
         assert mapp_env.Grid.from_text(text).walls.tolist() == [[False, False, meaning == "wall"]]
+
+
+def test_rows_of_a_map_begin_below_one_another() -> None:
+    """Indentation that all rows share is none; a row that begins elsewhere is refused."""
+    assert mapp_env.Grid.from_text("\n   D.\n   ..\n").walls.shape == (2, 2)
+    for text in ("  D.\n ..\n", " D.\n  ..\n", "D.\n  ..\n"):
+        with pytest.raises(ValueError, match="text:"):
+            mapp_env.Grid.from_text(text)
+
+
+def test_grids_of_other_depots_are_others() -> None:
+    """Walls alone make no grid: with another depot it is unequal, and its problems are refused."""
+    here, there = (mapp_env.Grid(np.zeros((3, 3), bool), depot) for depot in (0, 8))
+    assert here != there
+    assert mapp_env.Problem(here, (4,)) != mapp_env.Problem(there, (4,))
+    env = mapp_v0.parallel_env(grid=here, n_landmarks=1)
+    with pytest.raises(ValueError, match=r"options\['problem'\]"):
+        env.reset(options={"problem": mapp_env.Problem(there, (4,))})

@@ -3,6 +3,7 @@
 import copy
 import functools
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -818,3 +819,33 @@ def test_the_goal_changes_at_the_very_part(final_from):
     assert first is not last
     for progress in (0.0, 0.25, 0.499, 0.5, 0.75, 1.0):
         assert learner.goal(progress) is (last if progress >= final_from else first)
+
+
+def test_learners_of_one_checkpoint_share_nothing():
+    """Two learners that take over the same arrays go on alike, each by itself."""
+    start = small_training("default")
+    play_out(start)
+    arrays = {name: array.copy() for name, array in start.learner.arrays().items()}
+    state = copy.deepcopy(start.learner.state())
+    kept = {name: array.copy() for name, array in arrays.items()}
+    one, other = (small_training("default").learner for _ in range(2))
+    for learner in (one, other):
+        learner.restore(arrays, copy.deepcopy(state))
+    losses = [one.update(0.9) for _ in range(3)]
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(array, kept[name], err_msg=name)
+    assert [other.update(0.9) for _ in range(3)] == losses
+
+
+def test_the_papers_page_states_the_preset():
+    """The choices that docs/paper.md lists are the options of the preset "paper"."""
+    page = (Path(__file__).parents[1] / "docs" / "paper.md").read_text(encoding="utf-8")
+    options = preset_options(meta_dqn.Args, "paper")
+    for words in (
+        f"copied every {options.target_interval} updates",
+        f"{options.epsilon_start} to {options.epsilon_end} in a straight line over the first "
+        f"{options.epsilon_steps:,} steps",
+        f"| {options.memory_size:,} and {options.learning_starts} |",
+        f"team reward + {options.discount} x the largest",
+    ):
+        assert words in page, words

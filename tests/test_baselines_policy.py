@@ -20,6 +20,7 @@ from baselines.policy import (
     load_policy,
     save_policy,
 )
+from baselines.settings import read_setting
 from mapp_env import Grid, make_grid
 
 SPEC = NetworkSpec("paper", 3, 5, 4, 49, 16)
@@ -289,3 +290,53 @@ def test_largest_network_can_be_loaded_again(tmp_path):
     spec = NetworkSpec("paper", 16, 256, 5, 512 * 512, 4096)
     save_policy(tmp_path / "w", build_network(spec, torch_generator(np.random.SeedSequence(0))))
     assert load_policy(tmp_path / "w").spec == spec
+
+
+def test_of_equally_near_landmarks_the_first_given_is_taken():
+    """An agent between two landmarks walks to the one that comes first, visited ones left out."""
+    policy = NearestLandmarkPolicy(Grid.from_text("..D.."), 1, 3)
+    for landmarks, visited, action in (
+        ([0, 4, 3], [0, 0, 1], 0),
+        ([4, 0, 3], [0, 0, 1], 1),
+        ([3, 1, 4], [0, 0, 0], 1),
+        ([4, 1, 3], [0, 0, 0], 0),
+        ([3, 1, 4], [1, 0, 0], 0),
+    ):
+        seen = np.array([[2, *landmarks, *visited]], np.float32)
+        assert policy.act(seen).tolist() == [[action]]
+
+
+def test_one_large_weight_keeps_its_tensors_precision(tmp_path, network):
+    """In half precision a tensor with a value that 16 bits have no room for is kept as it is."""
+    with torch.no_grad():
+        network.layers[0].weight[0, 0] = 1e6
+    save_policy(tmp_path / "policy.safetensors", network, half_precision=True)
+    loaded = load_policy(tmp_path).network.state_dict()
+    for name, tensor in network.state_dict().items():
+        expected = tensor if name == "layers.0.weight" else tensor.half().float()
+        assert torch.equal(loaded[name], expected), name
+
+
+def test_flags_are_0_or_1(network):
+    """A landmark that is visited by half is refused, though it lies between what is allowed."""
+    seen = observations(1)
+    assert NetworkPolicy(network).act(seen).shape == (1, 3)
+    for place in range(8, 13):
+        seen = observations(1)
+        seen[0, place] = 0.5
+        with pytest.raises(ValueError, match="visited flags 0 or 1"):
+            NetworkPolicy(network).act(seen)
+
+
+def test_training_problems_have_the_runs_landmarks(tmp_path):
+    """A config whose problems have more or fewer landmarks than its options say is refused."""
+    options = {"n_agents": 3, "n_landmarks": 3, "max_cycles": 50}
+    grid = make_grid("paper-7x7").to_text()
+    for problem in ([0, 6], [0, 6, 20], [0, 6, 20, 42]):
+        config = {"grid": grid, "options": options, "training_problems": [problem]}
+        (tmp_path / "config.json").write_text(json.dumps(config))
+        if len(problem) == 3:
+            assert read_setting(tmp_path)[1] == [(0, 6, 20)]
+        else:
+            with pytest.raises(ValueError, match=r"training_problems\[0\]: must have 3 landmarks"):
+                read_setting(tmp_path)

@@ -318,3 +318,13 @@ def test_copies_continue_identically(face: str, copier: str, large: bool, same: 
     twin = copied(env)
     first = copy.deepcopy(run(twin, 75))
     same(first, copy.deepcopy(run(env, 75)))
+
+
+def test_make_vec_takes_the_form_of_actions() -> None:
+    """gymnasium.make_vec hands central_action on: by default that of the single environment."""
+    for given, kind in ((None, "Discrete"), ("joint", "Discrete"), ("multi", "MultiDiscrete")):
+        options = {} if given is None else {"central_action": given}
+        envs = gymnasium.make_vec(
+            "mapp_env/Central-v0", num_envs=2, vectorization_mode="vector_entry_point", **options
+        )
+        assert type(envs.unwrapped.single_action_space).__name__ == kind

@@ -542,3 +542,31 @@ def test_infos_are_each_agents_own() -> None:
     for agent in ("agent_1", "agent_2"):
         assert infos[agent]["metrics"]["cover_time"] == np.inf
         assert infos[agent]["action_mask"].max() == 1
+
+
+@pytest.mark.parametrize("face", ["parallel", "vector"])
+def test_copies_on_large_grids_go_on_alone(face: str) -> None:
+    """A copy made in mid-episode, where distances are kept for each landmark, has its own."""
+    grid = mapp_env.make_grid("random", rows=70, cols=70, seed=3)
+    settings: dict[str, Any] = {"grid": grid, "reward": "geodesic", "observation": "geodesic"}
+    if face == "parallel":
+        env: Any = mapp_v0.parallel_env(**settings)
+    else:
+        env = mapp_env.make_vec(2, **settings)
+
+    def play(each: Any, seed: int | None) -> list[Any]:
+        seen = [] if seed is None else [each.reset(seed=seed)[0]]
+        for action in (0, 1, 2, 3):
+            if face == "parallel":
+                seen.append(each.step(dict.fromkeys(each.agents, action))[:2])
+            else:
+                seen.append(each.step(np.full((2, 3), action))[:2])
+        return seen
+
+    play(env, 1)
+    twin = copy.deepcopy(env)
+    expected = str(play(env, None))
+    assert str(play(twin, None)) == expected
+    first = str(play(env, 2))
+    assert str(play(twin, 2)) == first
+    assert str(play(twin, 3)) == str(play(env, 3)) != first
