@@ -188,7 +188,7 @@ def test_a_policy_has_the_grid_that_its_config_names(tmp_path, network):
         ('{"grid": "x"}', "grid: text:1"),
         ('{"grid": 7}', "grid: text must be a str"),
         ('{"grid": "D.."}', "its grid has 3 cells, the weights have 49"),
-        (None, "not a regular file"),
+        (None, "No such file"),
     ):
         if text is None:
             config.unlink()
