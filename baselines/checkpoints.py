@@ -19,7 +19,7 @@ import numpy as np
 import safetensors.numpy
 
 from baselines.runs import CHECKPOINTS, METRICS_FILE, RunFolder, parse_json, read_metrics
-from mapp_env.files import read_bytes, write_bytes
+from mapp_env.files import make_folder, read_bytes, write_bytes
 
 FORMAT = "mapp_env checkpoint"
 VERSION = 2
@@ -113,7 +113,7 @@ class Checkpoints:
         ValueError
             If it cannot be written; those written before are as they were.
         """
-        self.folder.mkdir(exist_ok=True)
+        make_folder(self.folder)
         content = safetensors.numpy.save(
             {name: np.asarray(array, order="C") for name, array in arrays.items()}
         )

@@ -16,6 +16,7 @@ metrics.csv holds no wall time: two runs with one seed write the same bytes. Fil
 ``mapp_env.files``: whole or not at all.
 """
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -38,6 +39,7 @@ from filelock import FileLock, Timeout
 import mapp_env
 from mapp_env.files import (
     UNFINISHED,
+    make_folder,
     read_bytes,
     remove_unfinished,
     unique_fields,
@@ -87,7 +89,7 @@ class RunFolder:
         if resume and not (folder / CONFIG_FILE).is_file():
             raise ValueError(f"resume must be a run folder, got {str(folder)!r}")
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             occupied = not resume and foreign_entry(folder) is not None
         except OSError as error:
             raise ValueError(f"out must be a folder that can be made: {error}") from error
@@ -203,7 +205,8 @@ class RunFolder:
 
     def close(self) -> None:
         """Close metrics.csv and release the folder."""
-        self._metrics.close()
+        with contextlib.suppress(OSError):  # a row that has no room: that was said when it came
+            self._metrics.close()
         self._lock.release()
 
 

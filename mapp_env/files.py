@@ -11,6 +11,7 @@ import errno
 import json
 import math
 import os
+import pathlib
 import re
 import secrets
 import stat
@@ -26,6 +27,7 @@ __all__ = [
     "Record",
     "check_writable",
     "labelled",
+    "make_folder",
     "read_bytes",
     "read_record",
     "remove_unfinished",
@@ -425,8 +427,30 @@ def _replace(target: str, data: bytes) -> None:
         with contextlib.suppress(OSError):
             os.unlink(beside)
         raise
-    # The new name is on the disk only when the folder is. But the file is there by now: a folder
-    # that cannot be opened (a drop box) or forced to the disk (a share) is no failure.
+    _sync(folder)
+
+
+def make_folder(path: str | os.PathLike[str]) -> None:
+    """Make a folder and those above it, if they are not there, and force their names to the disk.
+
+    Raises
+    ------
+    OSError
+        If one cannot be made.
+    """
+    folder = pathlib.Path(path)
+    new = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in new:
+        _sync(place.parent)
+
+
+def _sync(folder: str | os.PathLike[str]) -> None:
+    """Force a folder to the disk: only then a new name is there after a crash of the machine.
+
+    One that cannot be opened (a drop box) or forced to the disk (a share) is no failure: what it
+    holds is there already.
+    """
     if os.name == "posix":
         with contextlib.suppress(OSError):
             handle = os.open(folder, os.O_RDONLY)

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -332,6 +333,21 @@ def test_a_training_that_never_came_to_be_is_in_nobodys_way(tmp_path):
             RunFolder(run, ["a", "b"])
         assert (run / name).read_text() == text
         (run / name).unlink()
+
+
+def test_a_row_that_has_no_room_is_said_once(tmp_path):
+    """Where metrics.csv cannot grow that is an OSError; the folder can be closed, and is free."""
+    run = RunFolder(tmp_path / "run", ["text"])
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            run.log({"text": "x" * 2000})
+        run.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    RunFolder.write_json(run, "config.json", {})
+    RunFolder(tmp_path / "run", ["text"], resume=True).close()
 
 
 SHORT = {

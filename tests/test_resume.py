@@ -224,6 +224,20 @@ def test_killed_at_any_moment_and_resumed(kind, whole, tmp_path):
         assert results(args.out) == expected
 
 
+def test_a_training_where_folders_cannot_be_synced(whole, tmp_path, monkeypatch):
+    """On a share that forces no folder to the disk a training runs as anywhere."""
+    fsync = os.fsync
+
+    def of_files(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(22, "Invalid argument")
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    assert run(options("paper", out=tmp_path / "run")) == 0
+    assert results(tmp_path / "run") == whole("paper")[0]
+
+
 @pytest.mark.parametrize("kind", ["default", "independent"])
 def test_without_a_second_thread_the_same(kind, tmp_path):
     """Preparing batches ahead in a second thread changes no byte."""
@@ -333,26 +347,30 @@ class Disk:
 
     def after_a_cut(self, copy: Path) -> Path:
         """Make a folder of what is left."""
-        for folder, names in self.names.items():
-            place = copy / folder.relative_to(self.root)
-            place.mkdir(parents=True, exist_ok=True)
-            for name, inode in names.items():
-                if not (folder / name).is_dir():
-                    (place / name).write_bytes(self.contents.get(inode, b""))
+        self._copy(self.root, copy)
         return copy
+
+    def _copy(self, folder: Path, copy: Path) -> None:
+        copy.mkdir()
+        for name, inode in self.names.get(folder, {}).items():
+            if (folder / name).is_dir():
+                self._copy(folder / name, copy / name)
+            else:
+                (copy / name).write_bytes(self.contents.get(inode, b""))
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs Linux")
 def test_a_power_cut_at_any_moment(tmp_path, monkeypatch):
     """What was forced to the disk by then is enough to go on to the same bytes."""
-    folder = tmp_path / "run"
-    disk, copies = Disk(folder), []
+    folder = tmp_path / "disk" / "runs" / "run"
+    disk, copies = Disk(tmp_path / "disk"), []
+    disk.root.mkdir()
     advance, calls, kept = experiment.Training.advance, [], []
 
     def watched(self):
         calls.append(None)
         if len(calls) in (1, 2, 45, 100, 190):
-            copies.append(disk.after_a_cut(tmp_path / f"cut{len(calls)}"))
+            copies.append(disk.after_a_cut(tmp_path / f"cut{len(calls)}") / "runs" / "run")
         return advance(self)
 
     def keep(handle: int) -> None:
@@ -364,7 +382,7 @@ def test_a_power_cut_at_any_moment(tmp_path, monkeypatch):
         patch.setattr(os, "fsync", keep)
         patch.setattr(experiment.Training, "advance", watched)
         assert run(options("default", out=folder)) == 0
-        copies.append(disk.after_a_cut(tmp_path / "end"))
+        copies.append(disk.after_a_cut(tmp_path / "end") / "runs" / "run")
     for handle in kept:
         os.close(handle)
     expected = results(folder)
