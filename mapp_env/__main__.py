@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 from pathlib import Path
@@ -11,8 +10,7 @@ from mapp_env.commands import main
 
 if __name__ == "__main__":
     # `python -m` searches the working folder first, also for the libraries that are loaded later.
-    with contextlib.suppress(FileNotFoundError):  # it may have been removed
-        home = str(Path(__file__).parents[1])
-        if not sys.flags.safe_path and sys.path[0] == os.getcwd() != home:
-            del sys.path[0]
+    home = str(Path(__file__).parents[1])
+    if not sys.flags.safe_path and sys.path[0] == os.getcwd() != home:
+        del sys.path[0]
     sys.exit(main())
