@@ -236,6 +236,65 @@ def test_imagined_goal_changes_when_it_is_said_to(gap):
         np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
 
 
+class Praising(torch.nn.Module):
+    """A network that thinks nothing better than moves that nobody has made."""
+
+    def __init__(self, network, learner):
+        super().__init__()
+        self.network, self.moves, self.spec = network, learner.imagined.moves, learner.spec
+
+    def forward(self, observations):
+        """Return the network's values, those of joint actions with such a move raised."""
+        n = self.spec.n_agents
+        unmade = self.moves[observations[:, :n].numpy().astype(int)] < 0  # (B, N, A)
+        unmade[unmade.all(axis=2)] = False  # where none has been made, any may be
+        if self.spec.outputs == "joint":
+            digits = np.array(list(np.ndindex(*[4] * n)))
+            unmade = unmade[:, np.arange(n), digits].any(axis=2)
+        return self.network(observations) + 100.0 * torch.from_numpy(unmade)
+
+
+def imagining(outputs, double, **others):
+    """Return a learner that knows some of the moves."""
+    changes = {"n_agents": 2, "n_landmarks": 2, "hidden_units": 8, "code_units": 4}
+    changes |= {"batch_size": 64, "imagined_length": 6, **others}
+    args = Args(outputs=outputs, double=double, **changes)
+    learner = MetaLearner(args, SQUARE, Streams.spawn(0))
+    rng = np.random.default_rng(1)
+    for cell, action in np.argwhere(rng.random((9, 4)) < 0.6):
+        here, there = (np.array([at, at, 0, 0, 0, 0]) for at in (cell, SQUARE.moves[cell, action]))
+        learner.remember(here, np.array([action] * 2), 0.0, there, False)
+    return learner
+
+
+@pytest.mark.parametrize("outputs", ["joint", "agents"])
+@pytest.mark.parametrize("double", [False, True])
+def test_moves_that_nobody_has_made_are_worth_nothing(outputs, double, same):
+    """Whatever a network thinks of them, they change no imagined transition and no target."""
+    plain, praising = imagining(outputs, double), imagining(outputs, double)
+    assert (plain.imagined.moves < 0).any()
+    praising.target = Praising(praising.target, praising)
+    praising.network = Praising(praising.network, praising)
+    for _ in range(12):
+        expected, found = plain.prepare(0.0), praising.prepare(0.0)
+        same(tuple(found[0]), tuple(expected[0]))
+        torch.testing.assert_close(found[1], expected[1])
+
+
+@pytest.mark.parametrize("outputs", ["joint", "agents"])
+@pytest.mark.parametrize("replay", ["imagined", "stored"])
+def test_targets_are_the_target_networks_alone(outputs, replay, same):
+    """But for double DQN what is prepared does not depend on the network that is trained."""
+    batches = []
+    for start in (0, 1):
+        learner = imagining(outputs, False, replay=replay)
+        other = MetaLearner(learner.args, SQUARE, Streams.spawn(start))
+        learner.network.load_state_dict(other.network.state_dict())
+        prepared = [learner.prepare(0.0) for _ in range(4)]
+        batches.append([(*batch, targets.numpy()) for batch, targets in prepared])
+    same(*batches)
+
+
 # -- memory ------------------------------------------------------------------------------------
 
 
@@ -434,10 +493,19 @@ def test_loop_stores_what_happened():
 
 
 @pytest.mark.parametrize(
-    ("preset", "due"), [("paper", {"update_interval": 4}), ("default", {"updates_per_episode": 5})]
+    ("preset", "due", "starts"),
+    [
+        ("paper", {"update_interval": 4}, 50),
+        ("paper", {"update_interval": 4}, 48),
+        ("default", {"updates_per_episode": 5}, 50),
+        ("default", {"updates_per_episode": 5}, 54),  # with the last step of an episode
+    ],
 )
-def test_updates_come_when_they_are_due(preset, due):
-    """One every so many steps or so many after each episode, none before learning starts."""
+def test_updates_come_when_they_are_due(preset, due, starts):
+    """One every so many steps or so many after each episode, none before learning starts.
+
+    It starts with the step of that number, not with the next one.
+    """
     args = preset_options(
         Args,
         preset,
@@ -446,7 +514,7 @@ def test_updates_come_when_they_are_due(preset, due):
         hidden_units=8,
         code_units=4,
         batch_size=4,
-        learning_starts=50,
+        learning_starts=starts,
         max_cycles=18,  # no multiple of 4: an episode's steps are not all steps
         **due,
     )
@@ -460,12 +528,58 @@ def test_updates_come_when_they_are_due(preset, due):
             continue
         before, steps = steps, steps + row["steps"]
         if preset == "paper":
-            expected = sum(step >= 50 and step % 4 == 0 for step in range(before + 1, steps + 1))
+            due_steps = range(-(-starts // 4) * 4, steps + 1, 4)
+            expected = sum(step > before for step in due_steps)
         else:
-            expected = 5 * (steps >= 50)
+            expected = 5 * (steps >= starts)
         assert row["updates"] == expected
         assert (row["loss"] == "") == (expected == 0)
     assert training.learner.updates > 0
+
+
+class Noting(MetaLearner):
+    """Learns nothing, and keeps how much of the training was said to be over at each update."""
+
+    ready = True
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.progress = []
+
+    def update(self, progress):
+        """Keep it."""
+        self.progress.append(progress)
+        return 0.0
+
+
+def rows_and_progress(preset, **changes):
+    """Return the options and rows of a training in which nothing is learned, and its progress."""
+    options = {"n_problems": 2, "episodes_per_problem": 3, "max_cycles": 10, "learning_starts": 1}
+    args = preset_options(Args, preset, hidden_units=8, **{**options, **changes})
+    problems = np.array([[0, 6, 20, 42, 48], [0, 6, 20, 42, 47]])
+    learner = Noting(args, make_grid(), Streams.spawn(0))
+    training = Training(args, make_grid(), problems, learner)
+    rows = []
+    while not training.finished:
+        row = training.advance()
+        rows += [row] if row else []
+    return args, rows, learner.progress
+
+
+def test_progress_rises_evenly():
+    """An episode's updates are spread evenly over it: step sizes fall in a straight line."""
+    _, _, progress = rows_and_progress("default", updates_per_episode=5)
+    assert progress == pytest.approx([update / 30 for update in range(30)])
+
+
+def test_a_row_has_the_influences_of_its_episode():
+    """Epsilon as at the episode's last step, guidance as in the whole of it."""
+    changes = {"epsilon_start": 1.0, "epsilon_end": 0.0, "epsilon_steps": 60}
+    guided = {"guidance_start": 0.6, "guidance_end": 0.0, "guidance_fraction": 1.0}
+    _, rows, _ = rows_and_progress("paper", **changes, **guided)
+    last = np.cumsum([row["steps"] for row in rows]) - 1
+    assert [row["epsilon"] for row in rows] == pytest.approx(1.0 - last / 60)
+    assert [row["guidance"] for row in rows] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])

@@ -46,6 +46,15 @@ def values_of(network, seen: np.ndarray) -> np.ndarray:
         return network(torch.from_numpy(seen)).numpy()
 
 
+def test_cells_arrive_between_0_and_1():
+    """The first cell is 0 to the paper's layers and the last one 1; flags are what they are."""
+    network = network_of("paper", 2, 2, "joint")
+    seen = []
+    network.layers.register_forward_pre_hook(lambda layers, given: seen.append(given[0]))
+    values_of(network, np.array([[0, 48, 24, 12, 1, 0]], np.float32))
+    np.testing.assert_array_equal(seen[0].numpy(), [[0, 1, 0.5, 0.25, 1, 0]])
+
+
 # -- symmetries --------------------------------------------------------------------------------
 
 

@@ -92,6 +92,24 @@ def test_the_best_episode_counts_and_waiting_ends(monkeypatch):
     assert (best.cover_time, n_episodes) == (longer[3].cover_time, 7)
 
 
+def test_without_a_solution_all_episodes_are_played(monkeypatch):
+    """However long it waits in vain; the first shows the policy, then as many as said explore."""
+    played, play = [], finetune.play
+
+    def noted(env, tuner, random):
+        played.append(random)
+        return play(env, tuner, random)
+
+    monkeypatch.setattr(finetune, "play", noted)
+    short = Setting(GRID, 2, 2, 1)  # no time to come to either landmark
+    problem = solve.make_problem(short, CELLS)
+    args = finetune.Args(landmarks=CELLS, episodes=9, random_episodes=3, patience=1, imagined=16)
+    best, n_episodes = finetune.finetune(args, untrained(), short, problem)
+    assert not best.success
+    assert n_episodes == 9
+    assert played == [False, *[True] * 3, *[False] * 5]
+
+
 def test_fine_tuning_from_the_command_line(folder, capsys):
     """One problem beside its optimum; several, of which it is counted how many became optimal."""
     short = {"imagined": 64, "updates_per_episode": 2, "policy": str(folder)}
