@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import json
 import os
@@ -544,14 +545,14 @@ def test_a_policy_has_all_the_steps_asked_for(
 
 def test_random_play_moves(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Random agents take the environment's four actions, all of them, and never wait."""
-    played = []
-    real = mapp_env.rendering.save_animation
+    rendering = importlib.import_module("mapp_env.rendering")
+    played, real = [], rendering.save_animation
 
     def save(path: str, problem: mapp_env.Problem, actions: Any, fps: float) -> int:
         played.append(np.array(actions))
         return real(path, problem, actions, fps)
 
-    monkeypatch.setattr(mapp_env.rendering, "save_animation", save)
+    monkeypatch.setattr(rendering, "save_animation", save)
     for seed in range(3):
         options = ["--plan", "random", "--landmarks", *CELLS, "--seed", str(seed)]
         assert main(["render", "--out", "a.gif", *options]) == 0

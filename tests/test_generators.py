@@ -287,3 +287,11 @@ def test_random_walls_are_the_nearest_number(rows: int, cols: int, density: floa
         for seed in range(20)
     ]
     assert min(counts) == round(density * rows * cols)
+
+
+def test_the_smallest_grids_have_room_for_a_landmark() -> None:
+    """However few cells are free, one besides the depot can be reached."""
+    for rows, cols in ((2, 2), (2, 3), (3, 2)):
+        for seed in range(60):
+            grid = make_grid("random", rows=rows, cols=cols, density=0.4, seed=seed)
+            assert_connected(grid)

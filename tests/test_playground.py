@@ -509,17 +509,24 @@ def test_damaged_weights_are_said(damage, said, visit, tmp_path):
     assert page.locator("button:enabled").count() == 0
 
 
+SEEDED = """let state = 7; Math.random = () => {
+    state = (state * 1103515245 + 12345) % 2147483648;
+    return state / 2147483648;
+}; 0"""
+
+
 def test_a_miss_is_found_and_its_gap_told(visit):
-    """The problem that the page finds is one of a longer cover time; its gap is to the optimum."""
+    """Problems that the page finds have a longer cover time; the gap is told to the optimum."""
     page = visit()
-    page.click("#miss")
-    said = "document.querySelector('#message').textContent.startsWith('Found after')"
-    page.wait_for_function(said, timeout=60_000)
-    landmarks = np.array([flags_of(page)])
-    plan, optimum = greedy_plans("pretrained", landmarks)[0], solve(Problem(GRID, landmarks[0]))
-    assert plan.cover_time > optimum.cover_time
-    shown = page.locator("#costs [data-cost=coverTime] td").all_inner_texts()
-    if plan.success:
+    page.evaluate(SEEDED)  # so that the page draws the same problems each time
+    for _ in range(4):
+        page.click("#miss")
+        said = "document.querySelector('#message').textContent.startsWith('Found after')"
+        page.wait_for_function(said, timeout=60_000)
+        landmarks = np.array([flags_of(page)])
+        plan, optimum = greedy_plans("pretrained", landmarks)[0], solve(Problem(GRID, landmarks[0]))
+        assert plan.cover_time > optimum.cover_time
+        shown = page.locator("#costs [data-cost=coverTime] td").all_inner_texts()
         assert shown[:2] == [str(plan.cover_time), str(optimum.cover_time)]
         gap = 100 * (plan.cover_time - optimum.cover_time) / optimum.cover_time
         assert float(shown[2].removesuffix(" %")) == pytest.approx(gap, abs=0.05)
