@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mapp_env.grid import Grid
 from mapp_env.gymnasium_env import SimulationEnv
 from mapp_env.observation import Observation
+from mapp_env.row_loops import fill_joint_mask, fill_joint_masks
 from mapp_env.task import Task, find_grid
 from mapp_env.validation import as_integer, check_choice, describe
 
@@ -83,20 +84,24 @@ def central_action_masks(
     ndarray of bool, shape (B, A**N) or, without numbered joint actions, (B, N * A)
         Of every joint action, or of each agent's actions one agent after the other.
     """
-    allowed = masks.astype(np.bool_)
     if joint_actions is None:
-        return allowed.reshape(len(allowed), -1)
-    agents = np.arange(joint_actions.shape[1])
-    every: NDArray[np.bool_] = np.all(allowed[:, agents, joint_actions], axis=-1)
-    return every
+        return masks.astype(np.bool_).reshape(len(masks), -1)
+    joint = np.empty((len(masks), len(joint_actions)), np.int8)
+    fill_joint_masks(masks, joint)
+    return joint.view(np.bool_)
 
 
 class CentralEnv(SimulationEnv):
     """The problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
 
     It sees what all agents see: the global observation once, or for the other kinds the agents'
-    observations stacked, shape (N, ...). ``info["action_mask"]`` is int8, shape (N, A); on the last
-    step ``info["metrics"]`` holds success, cover_time, makespan and total_distance.
+    observations stacked, shape (N, ...). ``info["action_mask"]`` is int8, shape (N, A): 0 for a
+    move that would bump; with numbered joint actions ``info["joint_action_mask"]``, shape (A**N,),
+    is 0 for those in which an agent would. On the last step ``info["metrics"]`` holds success,
+    cover_time, makespan and total_distance.
+
+    To draw an action that bumps nobody: ``action_space.sample(info["joint_action_mask"])``, or with
+    ``MultiDiscrete`` actions ``action_space.sample(tuple(info["action_mask"]))``.
 
     Parameters
     ----------
@@ -151,7 +156,7 @@ class CentralEnv(SimulationEnv):
             If seed or options cannot be used.
         """
         views, masks = self._start(seed, options)
-        return self._seen(views), {"action_mask": masks}
+        return self._seen(views), self._find_info(masks)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out a joint action.
@@ -164,7 +169,7 @@ class CentralEnv(SimulationEnv):
             If there is no episode to step.
         """
         reward, terminated, truncated, views, masks = self._play(action)
-        info: dict[str, Any] = {"action_mask": masks}
+        info = self._find_info(masks)
         if terminated or truncated:
             info["metrics"] = self._simulation.metrics()
         return self._seen(views), reward, terminated, truncated, info
@@ -186,6 +191,14 @@ class CentralEnv(SimulationEnv):
         _, masks = self._simulation.observe()
         found: NDArray[np.bool_] = central_action_masks(masks[None], self._joint_actions)[0]
         return found
+
+    def _find_info(self, masks: NDArray[np.int8]) -> dict[str, Any]:
+        """Return the info of a moment in which the agents have these masks, shape (N, A)."""
+        if self._joint_actions is None:
+            return {"action_mask": masks}
+        joint = np.empty(len(self._joint_actions), np.int8)
+        fill_joint_mask(masks, joint)
+        return {"action_mask": masks, "joint_action_mask": joint}
 
     def _read_action(self, action: Any) -> NDArray[np.int64]:
         """Return each agent's action, shape (N,)."""

@@ -13,6 +13,8 @@ from mapp_env.problem import draw_landmarks
 
 __all__ = [
     "fill_fields",
+    "fill_joint_mask",
+    "fill_joint_masks",
     "find_bad_action",
     "measure_rows",
     "observe_rows",
@@ -212,6 +214,31 @@ def fill_fields(
         for landmark in range(n_landmarks):
             start = rows[index, n_agents + landmark]
             fill_distances(table, start, fields[index * n_landmarks + landmark], queue)
+
+
+@kernel
+def fill_joint_mask(masks: NDArray[np.int8], joint: NDArray[np.int8]) -> None:
+    """Write which numbered joint actions bump no agent, (A**N,), of the agents' masks, (N, A)."""
+    n_agents, n_actions = masks.shape
+    for action in range(n_actions):
+        joint[action] = masks[n_agents - 1, action]
+    size = n_actions
+    for agent in range(n_agents - 2, -1, -1):
+        # What the agents behind this one may do, once for each of its actions; last for action 0,
+        # whose block is the one that is read.
+        for action in range(n_actions - 1, -1, -1):
+            allowed = masks[agent, action]
+            block = np.uint32(action * size)
+            for place in range(np.uint32(size)):
+                joint[block + place] = joint[place] & allowed
+        size *= n_actions
+
+
+@kernel
+def fill_joint_masks(masks: NDArray[np.int8], joint: NDArray[np.int8]) -> None:
+    """Do :func:`fill_joint_mask` for every row: ``masks`` (M, N, A) and ``joint`` (M, A**N)."""
+    for row in range(masks.shape[0]):
+        fill_joint_mask(masks[row], joint[row])
 
 
 @kernel

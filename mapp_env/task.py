@@ -185,13 +185,14 @@ class Task:
         seen.flags.writeable = False
         return seen, 0
 
-    def check_memory(self, n_rows: int) -> None:
+    def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
         """Refuse a number of rows whose arrays would not fit in memory.
 
         Raises
         ------
         ValueError
-            If the observations of one step, or the distance fields, take more than 1 GiB.
+            If the observations or the joint actions' masks of one step, or the distance fields,
+            take more than 1 GiB.
         """
         views = 1 if self.observation_kind == Observation.GLOBAL else self.n_agents
         size = 4 * n_rows * views * int(np.prod(self.view.shape))
@@ -199,6 +200,12 @@ class Task:
             raise ValueError(
                 f"observation={self.observation!r} of {n_rows} environment(s) with {self.n_agents} "
                 f"agents on {self.grid!r} would take {size} bytes a step, allowed are {MAX_BYTES}"
+            )
+        if n_rows * n_joint_actions > MAX_BYTES:
+            raise ValueError(
+                f"central_action: masks of {n_joint_actions} joint actions of {n_rows} rows "
+                f"would take {n_rows * n_joint_actions} bytes a step, allowed are {MAX_BYTES}: "
+                "use 'multi'"
             )
         size = 4 * n_rows * self.n_landmarks * self.grid.n_cells
         if self.needs_fields and size > MAX_BYTES:

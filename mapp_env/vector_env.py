@@ -25,7 +25,7 @@ from mapp_env.row_seeds import RowSeeds
 from mapp_env.rows import Rows
 from mapp_env.task import Task, find_grid
 from mapp_env.validation import check_choice, check_count
-from mapp_env.vector_infos import Transition, make_infos
+from mapp_env.vector_infos import Transition, add_masks, make_infos
 
 try:
     from gymnasium.vector import AutoresetMode
@@ -101,7 +101,9 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             allow_wait,
             render_mode,
         )
-        task.check_memory(self.num_envs)
+        self.single_action_space, self.joint_actions = central_action_space(task, central_action)
+        self._n_joint_actions = 0 if self.joint_actions is None else len(self.joint_actions)
+        task.check_memory(self.num_envs, self._n_joint_actions)
         self.task = task
         check_choice("render_mode", task.render_mode, (None, *VECTOR_RENDER_MODES))
         self.autoreset_mode = _find_mode(autoreset_mode)
@@ -114,7 +116,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         view = task.central_view
         self.single_observation_space = Box(view.low, view.high, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.single_action_space, self.joint_actions = central_action_space(task, central_action)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         n_views = 1 if task.observation_kind == Observation.GLOBAL else task.n_agents
@@ -203,7 +204,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self._started = True
         views, action_mask = self._rows.observe()
         action_mask[~mask] = 0
-        infos = {"action_mask": action_mask, "_action_mask": mask}
+        infos: dict[str, Any] = {}
+        add_masks(infos, action_mask, mask, self._n_joint_actions)
         return views.reshape(self._observations_shape), infos
 
     def step(
@@ -237,7 +239,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             Before the first reset, or with autoreset disabled if a row has ended.
         """
         transition = self.advance(actions)
-        return (*transition[:4], make_infos(transition))
+        return (*transition[:4], make_infos(transition, self._n_joint_actions))
 
     def advance(self, actions: NDArray[np.integer[Any]]) -> Transition:
         """Do what :meth:`step` does, and leave the infos to the caller.

@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Transition", "make_infos"]
+from mapp_env.row_loops import fill_joint_masks
+
+__all__ = ["Transition", "add_masks", "make_infos"]
 
 
 class Transition(NamedTuple):
@@ -26,15 +28,37 @@ class Transition(NamedTuple):
     restarted: bool  # whether the rows of ended have begun their next episode
 
 
-def make_infos(transition: Transition) -> dict[str, Any]:
-    """Return the infos of a step as ``gymnasium.vector.SyncVectorEnv`` gives them."""
+def make_infos(transition: Transition, n_joint_actions: int) -> dict[str, Any]:
+    """Return the infos of a step as ``gymnasium.vector.SyncVectorEnv`` gives them.
+
+    Parameters
+    ----------
+    transition : Transition
+        The step.
+    n_joint_actions : int
+        Number of joint actions A**N if rows take their numbers, else 0.
+    """
     infos: dict[str, Any] = {}
-    if len(transition.ended):
-        add_endings = _add_finals if transition.restarted else _add_metrics
-        add_endings(infos, transition)
-    infos["action_mask"] = transition.masks
-    infos["_action_mask"] = np.ones(len(transition.dones), np.bool_)
+    if len(transition.ended) and transition.restarted:
+        _add_finals(infos, transition, n_joint_actions)
+    elif len(transition.ended):
+        _add_metrics(infos, transition)
+    add_masks(infos, transition.masks, np.ones(len(transition.dones), np.bool_), n_joint_actions)
     return infos
+
+
+def add_masks(
+    infos: dict[str, Any],
+    masks: NDArray[np.int8],
+    rows: NDArray[np.bool_],
+    n_joint_actions: int,
+) -> None:
+    """Add the action masks, shape (B, N, A), of the rows that have any, shape (B,)."""
+    infos["action_mask"], infos["_action_mask"] = masks, rows
+    if n_joint_actions:
+        joint = np.empty((len(masks), n_joint_actions), np.int8)
+        fill_joint_masks(masks, joint)
+        infos["joint_action_mask"], infos["_joint_action_mask"] = joint, rows.copy()
 
 
 def _add_metrics(infos: dict[str, Any], transition: Transition) -> None:
@@ -50,7 +74,7 @@ def _add_metrics(infos: dict[str, Any], transition: Transition) -> None:
     infos["metrics"], infos["_metrics"] = metrics, dones.copy()
 
 
-def _add_finals(infos: dict[str, Any], transition: Transition) -> None:
+def _add_finals(infos: dict[str, Any], transition: Transition, n_joint_actions: int) -> None:
     """Add the last observations and infos of the rows that ended."""
     dones, ended, observations = transition.dones, transition.ended, transition.last_observations
     final_obs = np.empty(len(dones), dtype=object)  # of None
@@ -58,7 +82,8 @@ def _add_finals(infos: dict[str, Any], transition: Transition) -> None:
         final_obs[index] = observation
     action_mask = np.zeros_like(transition.masks)
     action_mask[ended] = transition.last_masks
-    final_info = {"action_mask": action_mask, "_action_mask": dones.copy()}
+    final_info: dict[str, Any] = {}
+    add_masks(final_info, action_mask, dones.copy(), n_joint_actions)
     _add_metrics(final_info, transition)
     infos["final_obs"], infos["_final_obs"] = final_obs, dones.copy()
     infos["final_info"], infos["_final_info"] = final_info, dones.copy()

@@ -81,6 +81,13 @@ def test_num_envs(value: Any) -> None:
         refusal("num_envs", value, lambda: mapp_env.make_vec(value))
 
 
+def test_masks_of_joint_actions_that_do_not_fit() -> None:
+    """More than 1 GiB of masks a step is refused, with what to do; all else is allowed."""
+    with pytest.raises(ValueError, match=r"central_action.*1073745920 bytes.*use 'multi'"):
+        mapp_env.make_vec(2**18 + 1, n_agents=6, central_action="joint")
+    mapp_env.make_vec(2**12, n_agents=6, central_action="joint")
+
+
 @pytest.mark.parametrize("name", ["n_agents", "n_landmarks", "max_cycles"])
 def test_absurd_counts_cost_nothing(name: str) -> None:
     """A count of a billion is refused before anything of that size is made."""

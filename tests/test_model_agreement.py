@@ -202,9 +202,13 @@ def test_central_env_plays_the_model(seed: int, central_action: str) -> None:
             assert type(terminated) is type(truncated) is bool
         check_numbers(observation, model.global_observation())
         assert env.observation_space.contains(observation)
-        check_mask(
-            info["action_mask"], [model.action_mask(agent) for agent in range(case.n_agents)]
-        )
+        masks = [model.action_mask(agent) for agent in range(case.n_agents)]
+        check_mask(info["action_mask"], masks)
+        if multi:
+            assert "joint_action_mask" not in info
+        else:  # the outer product of the agents' masks, the first agent most significant
+            every = functools.reduce(lambda some, mask: np.multiply.outer(some, mask), masks, 1)
+            check_mask(info["joint_action_mask"], every.ravel().tolist())
         check_metrics(info, model)
     assert model.ended
 

@@ -232,6 +232,51 @@ def test_seven_agents_have_a_multidiscrete_action() -> None:
     assert asked.action_space.nvec.tolist() == [4] * 2
 
 
+@pytest.mark.parametrize("allow_wait", [False, True])
+@pytest.mark.parametrize("form", ["joint", "multi", "tuple", "joint batch", "multi batch"])
+def test_masks_are_what_actions_are_drawn_with(form: str, allow_wait: bool) -> None:
+    """What the documentation says draws actions of each Gymnasium face draws none that bumps."""
+    settings = {"n_landmarks": 30, "allow_wait": allow_wait}
+    kind = form.split()[0]
+    batched = form.endswith("batch")
+    rng = np.random.default_rng(0)
+    if batched:
+        env: Any = mapp_env.make_vec(2, central_action=kind, **settings)
+    elif kind == "tuple":
+        env = gymnasium.make("mapp_env/Tuple-v0", observation="global", **settings)
+    else:
+        env = gymnasium.make("mapp_env/Central-v0", central_action=kind, **settings)
+    env.action_space.seed(0)
+    observation, info = env.reset(seed=0)
+    for _ in range(40):
+        mask = info.get("action_mask")
+        if form == "multi batch":
+            actions = (rng.random(mask.shape) * mask).argmax(axis=-1)
+        elif kind == "joint":
+            joint = info["joint_action_mask"]
+            actions = env.action_space.sample(tuple(joint) if batched else joint)
+        else:
+            mask = env.unwrapped.action_masks if kind == "tuple" else mask
+            actions = env.action_space.sample(tuple(mask))
+        before = cells_in(observation)
+        observation, *_, info = env.step(actions)
+        moves = agents_moves(actions, kind, 4 + allow_wait)
+        assert ((cells_in(observation) != before) | (moves == 4)).all()
+
+
+def cells_in(observation: Any) -> np.ndarray:
+    """Return the three agents' cells in a global observation, or in those of a tuple or a batch."""
+    return np.asarray(observation[0] if isinstance(observation, tuple) else observation)[..., :3]
+
+
+def agents_moves(actions: Any, kind: str, n_actions: int) -> np.ndarray:
+    """Return each of three agents' action, of a joint action or of a batch of them."""
+    if kind != "joint":
+        return np.asarray(actions)
+    places = np.unravel_index(np.asarray(actions), (n_actions,) * 3)
+    return np.stack(places, axis=-1)
+
+
 def test_supersuit_vectorises() -> None:
     """SuperSuit's vectoriser and concatenation step the parallel face with the right rewards."""
     with warnings.catch_warnings():

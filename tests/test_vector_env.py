@@ -368,15 +368,51 @@ def test_joint_numbers_in_a_batch(same: Any) -> None:
     for venv in (joint, made):
         assert venv.single_action_space == gymnasium.spaces.Discrete(16)
         assert venv.action_space.shape == (3,)
+
+    def without_joint_masks(result: Any) -> Any:
+        infos = {key: value for key, value in result[-1].items() if "joint" not in key}
+        assert result[-1]["_joint_action_mask"].all()
+        return (*result[:-1], infos)
+
     first = plain.reset(seed=6)
-    same(first, joint.reset(seed=6))
+    same(first, without_joint_masks(joint.reset(seed=6)))
     rng = np.random.default_rng(6)
     for _ in range(40):
         actions = random_actions(rng, plain)
-        same(plain.step(actions), joint.step(actions[:, 0] * 4 + actions[:, 1]))
+        numbers = actions[:, 0] * 4 + actions[:, 1]
+        same(plain.step(actions), without_joint_masks(joint.step(numbers)))
     for bad in ([16, 0, 0], [-1, 0, 0], [0, 0], [[0, 0]] * 3, [0.5, 0, 0]):
         with pytest.raises(ValueError, match="action"):
             joint.step(np.array(bad))
+
+
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+def test_joint_rows_equal_sync_vector_env(mode: AutoresetMode, same: Any) -> None:
+    """With numbered joint actions whole infos are SyncVectorEnv's, too, masks of them included.
+
+    Writing into the masks changes nothing later.
+    """
+    make = {"id": "mapp_env/Central-v0", "num_envs": 4, "allow_wait": True, **settings()}
+    ours = gymnasium.make_vec(**make, autoreset_mode=mode)
+    theirs = gymnasium.make_vec(
+        **make, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}
+    )
+    seeds = [3, 4, 5, 6]
+    result = ours.reset(seed=seeds)
+    same(result, theirs.reset(seed=seeds))
+    rng, ends = np.random.default_rng(8), 0
+    for _ in range(60):
+        assert result[-1]["joint_action_mask"].shape == (4, 25)
+        result[-1]["joint_action_mask"][:] = 0
+        actions = rng.integers(25, size=4)
+        result = ours.step(actions)
+        same(result, theirs.step(actions))
+        ended = result[2] | result[3]
+        ends += int(ended.sum())
+        if mode == AutoresetMode.DISABLED and ended.any():
+            result = ours.reset(options={"reset_mask": ended.copy()})
+            same(result, theirs.reset(options={"reset_mask": ended.copy()}))
+    assert ends > 8
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
