@@ -78,7 +78,10 @@ def test_the_sdist_builds_the_same_wheel(built: Path, tmp_path: Path) -> None:
 
 
 def test_the_version_stands_in_one_place(built: Path) -> None:
-    """The wheel's version is the package's; no other file says it but the record of changes."""
+    """The wheel's version is the package's; besides it only changes and citations say it.
+
+    `test_citations_agree` holds that those say the same.
+    """
     (path,) = built.glob("*.whl")
     with zipfile.ZipFile(path) as archive:
         metadata = archive.read(f"{NAME}.dist-info/METADATA").decode()
@@ -86,7 +89,7 @@ def test_the_version_stands_in_one_place(built: Path) -> None:
     said = rf'^\s*(__)?version(__)?\s*[:=]\s*"?{re.escape(mapp_env.__version__)}"?\s*$'
     places = [
         path.name
-        for pattern in ("*.toml", "*.cff", "mapp_env/**/*.py", "docs/*.py")
+        for pattern in ("*.toml", "mapp_env/**/*.py", "docs/*.py")
         for path in REPOSITORY.glob(pattern)
         if re.search(said, path.read_text(encoding="utf-8"), re.MULTILINE)
     ]
