@@ -1,6 +1,6 @@
 """Stable-Baselines3 on the batched engine: PPO, one network that commands all agents.
 
-`make_sb3_vec` is `mapp_env.make_vec` as a VecEnv: no environment a row, no dictionary a row. The
+`make_sb3_vec` is `mapp_env.make_vec` as a VecEnv: no environment a row. The
 network sees each agent's shortest paths to the landmarks (`observation="geodesic"`) and gives an
 action for each agent. What it reached is in docs/trainers.md.
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
-import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -30,6 +28,7 @@ from stable_baselines3.common.env_checker import check_env  # noqa: E402
 from stable_baselines3.common.evaluation import evaluate_policy  # noqa: E402
 from stable_baselines3.common.vec_env import (  # noqa: E402
     DummyVecEnv,
+    VecEnvWrapper,
     VecMonitor,
     VecNormalize,
 )
@@ -47,6 +46,15 @@ SETTINGS: list[dict[str, Any]] = [
     {"n_agents": 1, "n_landmarks": 1, "max_cycles": 25, "observation": "planes"},
 ]
 ENDINGS = {"TimeLimit.truncated", "terminal_observation"}
+
+
+FORMS: dict[str, Callable[..., Any]] = {
+    "multi": lambda **more: make_sb3_vec(3, n_landmarks=2, max_cycles=12, **more),
+    "joint": lambda **more: make_sb3_vec(
+        3, central_action="joint", n_landmarks=2, max_cycles=12, **more
+    ),
+    "shared": lambda **more: make_sb3_shared(2, n_landmarks=2, max_cycles=12, **more),
+}
 
 
 def batched_actions(envs: Any, rng: np.random.Generator) -> np.ndarray:
@@ -154,23 +162,67 @@ def test_engine_takes_problems() -> None:
     assert envs.reset()[:, 3:6].tolist() == kept.tolist()
 
 
-def test_engine_keeps_nothing_of_what_it_gives() -> None:
-    """Writing into what was returned changes nothing; infos of unfinished rows refuse it."""
-    envs = make_sb3_vec(2)
-    envs.seed(0)
-    before = envs.reset()
-    kept = before.copy()
-    before[:] = -1
-    observations, _, _, infos = envs.step(np.zeros((2, 3), np.int64))
-    assert (observations[:, 3:8] == kept[:, 3:8]).all()
-    with pytest.raises(TypeError):
-        infos[0]["mark"] = 1
-    with pytest.raises(TypeError):
-        infos[0].update(mark=1)
-    for copied in (infos[0].copy(), copy.copy(infos[0]), copy.deepcopy(infos)[0]):
-        copied["mark"] = 1
-    assert pickle.loads(pickle.dumps(infos)) == [{}, {}]
-    assert infos == [{}, {}]
+@pytest.mark.parametrize("form", FORMS)
+def test_what_is_returned_is_the_callers(form: str, same: Callable[[Any, Any], None]) -> None:
+    """Writing into whatever was returned changes nothing later, and each info is its row's own."""
+    clean, dirty = FORMS[form](), FORMS[form]()
+    rng, ended = np.random.default_rng(0), 0
+    for envs in (clean, dirty):
+        envs.seed(0)
+    same(clean.reset(), dirty.reset())
+    for _ in range(40):
+        actions = batched_actions(clean, rng)
+        results = [envs.step(actions.copy()) for envs in (clean, dirty)]
+        for info in (*results[0][3], *results[1][3]):
+            info.get("episode", {}).pop("t", None)  # seconds
+        same(*results)
+        observations, rewards, dones, infos = results[1]
+        ended += int(dones.sum())
+        for row, info in enumerate(infos):
+            info["row"] = row
+            for value in list(info.values()):
+                if isinstance(value, dict):
+                    value.clear()
+                elif isinstance(value, np.ndarray):
+                    value.fill(0)
+        assert [info["row"] for info in infos] == list(range(clean.num_envs))
+        observations.fill(-1)
+        rewards.fill(-1)
+        dones.fill(True)
+        same(clean.action_masks(), dirty.action_masks())
+        dirty.action_masks().fill(False)
+    assert ended > 6
+
+
+class AddsKeys(VecEnvWrapper):
+    """Keep each row's own reward in its info, as imitation's RewardVecEnvWrapper does."""
+
+    def reset(self) -> np.ndarray:
+        """Start the episodes."""
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        """Step, and write into every info."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info, reward in zip(infos, rewards, strict=True):
+            info["original_env_rew"] = reward
+        return observations, -rewards, dones, infos
+
+
+@pytest.mark.parametrize("form", ["multi", "shared"])
+def test_wrappers_may_add_to_infos(form: str) -> None:
+    """A training learns through a wrapper that writes each row's reward into its info."""
+    envs = AddsKeys(FORMS[form]())
+    seen: list[bool] = []
+
+    def look(known: dict[str, Any], _: dict[str, Any]) -> bool:
+        infos, rewards = known["infos"], known["rewards"]
+        seen.append([info["original_env_rew"] for info in infos] == (-rewards).tolist())
+        return True
+
+    PPO("MlpPolicy", envs, n_steps=16, batch_size=24, seed=0, device="cpu").learn(100, look)
+    assert len(seen) > 10
+    assert all(seen)
 
 
 def test_engine_shows_its_rows() -> None:
@@ -265,15 +317,6 @@ def test_clock_stops_a_training() -> None:
     watch.seconds = 1000.0
     model.learn(40, callback=watch)  # the clock begins anew
     assert model.num_timesteps >= 40
-
-
-FORMS: dict[str, Callable[..., Any]] = {
-    "multi": lambda **more: make_sb3_vec(3, n_landmarks=2, max_cycles=12, **more),
-    "joint": lambda **more: make_sb3_vec(
-        3, central_action="joint", n_landmarks=2, max_cycles=12, **more
-    ),
-    "shared": lambda **more: make_sb3_shared(2, n_landmarks=2, max_cycles=12, **more),
-}
 
 
 @pytest.mark.parametrize("allow_wait", [False, True])
