@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,10 @@ class Display:
         self.mode = mode
         self.fps = fps
         self._window: Window | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy all but the window: a copy opens its own when it has something to show."""
+        return {**self.__dict__, "_window": None}
 
     def show(self, scene: Scene) -> NDArray[np.uint8] | str | None:
         """Return the picture, or show it in the window and return ``None``."""

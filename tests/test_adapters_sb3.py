@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
+import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -160,6 +162,30 @@ def test_engine_takes_problems() -> None:
     assert envs.reset()[:, 3:6].tolist() != kept.tolist()
     envs.set_options([{"landmarks": [0, (0, 1), 2]}, {"landmarks": kept[1]}])
     assert envs.reset()[:, 3:6].tolist() == kept.tolist()
+
+
+@pytest.mark.parametrize("copier", ["pickle", "deepcopy"])
+@pytest.mark.parametrize("form", FORMS)
+def test_copies_continue_identically(
+    form: str, copier: str, same: Callable[[Any, Any], None]
+) -> None:
+    """A copy made in mid-episode, stepped first, goes on as the original does, masks included."""
+    envs = FORMS[form]()
+    envs.seed(5)
+    envs.reset()
+
+    def play(envs: Any, n_steps: int) -> list[Any]:
+        rng, seen = np.random.default_rng(1), []
+        for _ in range(n_steps):
+            *result, infos = envs.step(batched_actions(envs, rng))
+            lengths = [info.get("episode", {}).get("l") for info in infos]
+            seen.append((result, envs.action_masks(), lengths))
+        return seen
+
+    play(envs, 5)
+    twin = pickle.loads(pickle.dumps(envs)) if copier == "pickle" else copy.deepcopy(envs)
+    first = copy.deepcopy(play(twin, 40))
+    same(first, play(envs, 40))
 
 
 @pytest.mark.parametrize("form", FORMS)

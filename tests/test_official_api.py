@@ -303,13 +303,13 @@ def play(env: Any, rng: np.random.Generator, steps: int) -> list[Any]:
     """Step ``env`` with actions from ``rng``; return everything it returned."""
     seen = []
     for _ in range(steps):
-        seen.append(env.step(rng.integers(4, size=env.action_space.shape)))
+        seen.append(env.step(rng.integers(4, size=env.action_space.shape or (3,))))
     return seen
 
 
 @pytest.mark.parametrize("large", [False, True], ids=["paper", "large"])
 @pytest.mark.parametrize("copier", ["pickle", "deepcopy"])
-@pytest.mark.parametrize("face", ["parallel", "aec", "central", "vector"])
+@pytest.mark.parametrize("face", ["parallel", "aec", "central", "tuple", "vector"])
 def test_copies_continue_identically(face: str, copier: str, large: bool, same: Any) -> None:
     """A pickled or deep copy made in mid-episode plays on, and draws on, exactly as the original.
 
@@ -344,22 +344,25 @@ def test_copies_continue_identically(face: str, copier: str, large: bool, same: 
             return seen
 
     else:
-        env = (
-            gymnasium.make("mapp_env/Central-v0", central_action="multi", **settings)
-            if face == "central"
-            else mapp_env.make_vec(4, **settings)
-        )
+        env = {
+            "central": lambda: gymnasium.make(
+                "mapp_env/Central-v0", central_action="multi", **settings
+            ),
+            "tuple": lambda: gymnasium.make("mapp_env/Tuple-v0", **settings),
+            "vector": lambda: mapp_env.make_vec(4, **settings),
+        }[face]()
 
         def run(env: Any, steps: int) -> list[Any]:
             rng, seen = np.random.default_rng(1), []
             for _ in range(steps):
                 seen.extend(play(env, rng, 1))
-                if face == "central" and (seen[-1][2] or seen[-1][3]):
+                if face != "vector" and (seen[-1][2] or seen[-1][3]):
                     seen.append(env.reset())
             return seen
 
     env.reset(seed=4)
     run(env, 10)
+    env.unwrapped.max_cycles = 20
     twin = copied(env)
     first = copy.deepcopy(run(twin, 75))
     same(first, copy.deepcopy(run(env, 75)))

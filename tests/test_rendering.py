@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import itertools
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
+from mapp_env import mapp_v0
 from mapp_env.grid import Grid
 from mapp_env.plan import Plan
 from mapp_env.problem import Problem
@@ -350,6 +354,48 @@ def test_window_leaves_a_running_display_alone(human: Any) -> None:
     pygame.display.quit()
     window.show(rgb_array(start()), 0)
     window.close()
+
+
+@pytest.mark.parametrize("copier", ["pickle", "deepcopy"])
+@pytest.mark.parametrize("face", ["parallel", "aec", "central", "tuple"])
+def test_copies_open_windows_of_their_own(human: Any, face: str, copier: str) -> None:
+    """A copy made when a frame has been shown shows what follows, in a window of its own."""
+    make: dict[str, Any] = {
+        "parallel": mapp_v0.parallel_env,
+        "aec": mapp_v0.env,
+        "central": lambda **more: gymnasium.make("mapp_env/Central-v0", **more),
+        "tuple": lambda **more: gymnasium.make("mapp_env/Tuple-v0", **more),
+    }
+    env = make[face](render_mode="human", observation="global")
+    env.unwrapped._display.fps = 0  # no waiting between frames
+    env.reset(seed=3)
+    twin = pickle.loads(pickle.dumps(env)) if copier == "pickle" else copy.deepcopy(env)
+    assert len(human._open_windows) == 1
+    frames = []
+    for each in (twin, env):
+        for action in (0, 1, 2):
+            if face == "parallel":
+                each.step(dict.fromkeys(each.agents, action))
+            elif face == "aec":
+                for _ in each.agents:
+                    each.step(action)
+            else:
+                each.step((action,) * 3 if face == "tuple" else action)
+        assert len(human._open_windows) == 2
+        surface = human._open_windows[-1 if each is twin else 0]._window.get_surface()
+        frames.append(pygame_array(surface))
+    assert np.array_equal(frames[0], frames[1])
+    env.close()
+    assert len(human._open_windows) == 1
+    twin.render()
+    twin.close()
+
+
+def pygame_array(surface: Any) -> np.ndarray:
+    """Return a copy of a surface's pixels."""
+    import pygame
+
+    return pygame.surfarray.array3d(surface)
 
 
 def test_window_keeps_the_pace(human: Any) -> None:
