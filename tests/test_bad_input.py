@@ -127,6 +127,92 @@ def test_most_landmarks() -> None:
         mapp_env.Problem(grid, cells, 2)
 
 
+LINE = mapp_env.Grid.from_text("D...")
+
+
+def faces_and_problem(**arguments: Any) -> None:
+    """Ask every face, and a problem, for something that all of them limit alike."""
+    for make in FACES.values():
+        make(grid=LINE, n_landmarks=2, **arguments)
+    mapp_env.Problem(LINE, (1, 2), **arguments)
+
+
+SHAPES = {4096: (64, 64), 4097: (17, 241)}  # of grids with so many cells
+
+# Name, largest allowed value, and what takes it.
+LIMITS: dict[str, tuple[str, int, Callable[[int], Any]]] = {
+    "rows": ("walls", 512, lambda n: mapp_env.Grid(np.zeros((n, 1), bool))),
+    "columns": ("walls", 512, lambda n: mapp_env.Grid(np.zeros((1, n), bool))),
+    "rows of a text": ("rows", 512, lambda n: mapp_env.Grid.from_text("..\n" * n)),
+    "columns of a text": ("columns", 512, lambda n: mapp_env.Grid.from_text("." * n)),
+    "height": (
+        "height",
+        512,
+        lambda n: mapp_env.Grid.from_text(f"type octile\nheight {n}\nwidth 1\nmap\n" + ".\n" * n),
+    ),
+    "characters of a text": (
+        "characters", 1 << 20, lambda n: mapp_env.Grid.from_text("D." + "\n" * (n - 2))
+    ),
+    **{
+        f"{side} of {kind}": (
+            side, 512, lambda n, kind=kind, side=side: mapp_env.make_grid(kind, **{side: n})
+        )
+        for kind in ("maze", "random", "rooms", "warehouse")
+        for side in ("rows", "cols")
+    },
+    "agents": ("n_agents", 16, lambda n: faces_and_problem(n_agents=n)),
+    "agents of a universe": (
+        "n_agents", 16, lambda n: mapp_env.solvers.solve_universe(LINE, 1, n_agents=n)
+    ),
+    "agents of many problems": (
+        "n_agents", 16, lambda n: mapp_env.solvers.optimal_costs(LINE, [[1]], n_agents=n)
+    ),
+    "steps": ("max_cycles", 1_000_000, lambda n: faces_and_problem(max_cycles=n)),
+    "steps assigned": (
+        "max_cycles", 1_000_000, lambda n: setattr(mapp_v0.parallel_env(), "max_cycles", n)
+    ),
+    "cells with all distances": (
+        "cells", 4096, lambda n: mapp_env.Grid(np.zeros(SHAPES[n], bool)).distances
+    ),
+    "seed of a draw": ("seed", 2**63 - 1, lambda n: mapp_env.sample_problems(LINE, 1, 1, seed=n)),
+    "seed of a grid": ("seed", 2**128 - 1, lambda n: mapp_env.make_grid("rooms", seed=n)),
+    "seed of a search": (
+        "seed", 2**128 - 1, lambda n: mapp_env.solve(mapp_env.Problem(LINE, (1,)), seed=n)
+    ),
+    "seed of an episode": ("seed", 2**128 - 1, lambda n: mapp_v0.parallel_env().reset(seed=n)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", LIMITS)
+def test_limits_are_as_documented(case: str) -> None:
+    """The largest value that is documented is taken; one more is refused by name."""
+    name, limit, call = LIMITS[case]
+    call(limit)
+    with pytest.raises(ValueError, match=name) as caught:
+        call(limit + 1)
+    assert re.search(rf"\b({limit}|{limit + 1})\b", str(caught.value))
+
+
+def test_the_largest_file_is_read(tmp_path: Path) -> None:
+    """A map file of exactly a mebibyte is read, one of a byte more is not."""
+    path = tmp_path / "large.map"
+    path.write_text("D." + "\n" * ((1 << 20) - 2))
+    assert mapp_env.Grid.load(path) == mapp_env.Grid.from_text("D.")
+    path.write_text("D." + "\n" * ((1 << 20) - 1))
+    with pytest.raises(mapp_env.MapError, match=r"large\.map: has 1048577 bytes"):
+        mapp_env.Grid.load(path)
+
+
+def test_most_problems_drawn() -> None:
+    """Up to ten million problems may be drawn at once, where there are so many."""
+    for count, reason in (
+        (10**7, "at most 3, the number of problems"),
+        (10**7 + 1, "in 1..10000000"),
+    ):
+        with pytest.raises(ValueError, match=f"n_problems must be .*{reason}"):
+            mapp_env.sample_problems(LINE, count, 1)
+
+
 def test_more_landmarks_than_cells() -> None:
     """More landmarks than the grid has cells for are refused; exactly as many are fine."""
     grid = mapp_env.Grid.from_text("D..\n")
@@ -621,6 +707,8 @@ BAD_TEXTS: dict[str, tuple[str, str]] = {
     "unknown letter": ("D..\n...\n.x.\n", "3"),
     "digit": ("D1.\n", "1"),
     "letter outside ASCII": ("D..\n.é.\n", "2"),
+    "two depots in a row": ("...\n...\nD.D\n", "3"),
+    "two depots side by side": ("...\n...\n.DD\n", "3"),
     "two depots": ("D..\n...\n..D\n", "3"),
     "walls only": ("###\n###\n", ""),
     "513 wide": ("." * 513 + "\n", "513"),
@@ -666,7 +754,9 @@ def test_malformed_maps(case: str, tmp_path: Path) -> None:
         with pytest.raises(ValueError) as caught:  # noqa: PT011
             call()
         assert wanted in str(caught.value)
-        if case in ("ragged", "unknown letter", "two depots", "inner blank line"):
+        if case in ("ragged", "unknown letter", "inner blank line") or case.startswith(
+            "two depots"
+        ):
             assert re.search(rf":{hint}:|\bline {hint}\b", str(caught.value))
         assert len(str(caught.value)) < 600
 
@@ -692,6 +782,22 @@ def test_maps_that_are_read(case: str, tmp_path: Path) -> None:
     assert mapp_env.Grid.from_text(READ_TEXTS[case]) == grid
     (tmp_path / "a.map").write_bytes(READ_TEXTS[case].encode("utf-8"))
     assert mapp_env.Grid.load(tmp_path / "a.map") == grid
+
+
+@pytest.mark.parametrize(
+    ("header", "free", "walls"),
+    [("", ".G", "#@TO"), ("type octile\nheight 1\nwidth 3\nmap\n", ".GS", "#@TOW")],
+    ids=["plain", "MovingAI"],
+)
+def test_every_letter_of_a_map(header: str, free: str, walls: str) -> None:
+    """Water is a wall, a swamp is free; no letter but these few, and the depot's, is a cell."""
+    for letter in map(chr, range(33, 127)):
+        if letter in free + walls:
+            grid = mapp_env.Grid.from_text(f"{header}D.{letter}")
+            assert grid.walls.tolist() == [[False, False, letter in walls]], letter
+        else:
+            with pytest.raises(mapp_env.MapError):
+                mapp_env.Grid.from_text(f"{header}D.{letter}")
 
 
 def test_a_text_is_indented_like_the_code_around_it(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from mapp_env.files import (
     MAX_PLAN_BYTES,
     MAX_PROBLEM_BYTES,
     check_writable,
+    read_bytes,
     remove_unfinished,
     write_bytes,
     write_text,
@@ -405,6 +406,19 @@ def test_a_file_that_cannot_be_read_is_refused(
     monkeypatch.setattr(os, "fdopen", lambda *_, **__: Broken())
     with pytest.raises(FileError, match=r"problem\.json: cannot be read: bad disk"):
         Problem.load(path)
+
+
+def test_a_file_that_grows_is_refused() -> None:
+    """A file that turns out to hold more than it said is refused, not cut.
+
+    Linux says of its own that they are empty.
+    """
+    path = "/proc/self/status"
+    if not os.path.isfile(path) or os.stat(path).st_size > 0:
+        pytest.skip("needs Linux")
+    assert len(read_bytes(path, 1 << 20, "a file", FileError)) > 100
+    with pytest.raises(FileError, match="has more than 100 bytes, which a file may have"):
+        read_bytes(path, 100, "a file", FileError)
 
 
 def test_a_tampered_plan_is_refused(tmp_path: Path) -> None:

@@ -627,6 +627,27 @@ def test_largest_grid_and_counts() -> None:
         assert rewards["agent_0"] == (-1.0 if reward == "step" else -float(far))
 
 
+def test_the_longest_way() -> None:
+    """On a path of 131,327 steps, the longest of a 512x512 serpentine, no distance is cut short."""
+    walls = np.zeros((512, 512), bool)
+    walls[1::2] = True
+    walls[1::4, -1] = walls[3::4, 0] = False
+    grid = mapp_env.Grid(walls, depot=0)
+    end = int(grid.home.argmax())
+    assert grid.home[end] == 131_327
+    env = mapp_v0.parallel_env(
+        grid=grid, n_agents=2, n_landmarks=1, reward="geodesic", observation="geodesic"
+    )
+    env.reset(options={"landmarks": [end]})
+    observations, rewards, *_ = env.step({"agent_0": 1, "agent_1": 0})
+    assert rewards["agent_0"] == -131_326
+    for agent, ways in (("agent_0", (131_326, 131_327)), ("agent_1", (131_327, 131_326))):
+        seen = observations[agent][1:3] * (512 + 512)
+        np.testing.assert_allclose(seen, ways, rtol=1e-7)
+    plan = mapp_env.solve(mapp_env.Problem(grid, (end,), 2))
+    assert (plan.cost, plan.makespan) == (131_327, 2 * 131_327)
+
+
 def test_problem_brings_its_own_limit() -> None:
     """A Problem's max_cycles limits its own episode, on all faces, and no later one."""
     problem = mapp_env.Problem(

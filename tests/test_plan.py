@@ -167,6 +167,7 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "infinite": ({"cover_time": math.inf, "status": "infeasible"}, "cover_time is stated as inf"),
     "actions": ({"actions": ((0, 1), (2, 2), (0, 0))}, "actions are not"),
     "other actions": ({"actions": ((0, 1), (2, 3))}, "rules give"),
+    "no claim steps": ({"claim_steps": ()}, "claim_steps and actions"),
     "claim steps": ({"claim_steps": ((1,), (2,))}, "claim_steps and actions"),
     "objective": ({"objective": "time"}, "objective must be one of"),
     "status": ({"status": "great"}, "status must be one of"),
@@ -179,6 +180,8 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "no number for a bound": ({"bound": math.nan}, "bound must be an integer from 0, got nan"),
     "bound below 0": ({"bound": -1}, "bound must be an integer from 0, got -1"),
     "no number of seconds": ({"seconds": math.nan}, "seconds must be a number from 0, got nan"),
+    "an absurd number of seconds": ({"seconds": 1e300}, "seconds must be a number from 0, got 1e"),
+    "negative seconds": ({"seconds": -1e-9}, "seconds must be a number from 0, got -1e-09"),
     "a long name": ({"solver": "x" * 101}, "solver must be a str of at most 100 letters"),
     "below the bound": ({"status": "optimal", "bound": 1}, "'optimal' needs bound"),
 }

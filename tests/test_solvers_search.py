@@ -21,7 +21,7 @@ from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
 from mapp_env.solvers.ruin_recreate import recreate
 from mapp_env.solvers.search import Search, solve_search
-from mapp_env.solvers.solution import Solution
+from mapp_env.solvers.solution import Solution, solution_of
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 needs_pyvrp = pytest.mark.skipif(
@@ -159,6 +159,19 @@ def test_more_iterations_are_never_worse(objective: str) -> None:
         now = (all_costs[objective], all_costs["total_distance"])
         assert now <= before, iterations
         before = now
+
+
+def test_no_more_iterations_than_asked_for() -> None:
+    """What is found in 700 iterations is what 700 iterations find, where more would do better."""
+    problem = generated_problem("random", 40, 40, 4, 1)
+    distances = landmark_distances(problem)
+    found = []
+    for iterations in (700, 1001):
+        search = Search(distances, problem.n_agents, "makespan", 3)
+        search.run(iterations)
+        found.append(solution_of(problem, search.routes(), search.cost, 0).routes)
+    assert found[0] != found[1]
+    assert solve_search(problem, "makespan", iterations=700, seed=3).routes == found[0]
 
 
 def test_on_better_reports_falling_costs() -> None:
