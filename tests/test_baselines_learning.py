@@ -295,6 +295,41 @@ def test_targets_are_the_target_networks_alone(outputs, replay, same):
     same(*batches)
 
 
+@pytest.mark.parametrize("outputs", ["joint", "agents"])
+def test_double_dqn_in_imagination(outputs):
+    """The next action is the trained network's choice, and its value the target network's."""
+    learner = imagining(outputs, True, action_gap=0.0)
+    learner.imagined.moves[:] = SQUARE.moves
+    other = MetaLearner(learner.args, SQUARE, Streams.spawn(1))
+    learner.target.load_state_dict(other.network.state_dict())
+    batch, targets = learner.prepare(0.0)
+    following = torch.from_numpy(batch.next_observations)
+    with torch.no_grad():
+        own, slow = (
+            network(following.flatten(0, 1)).unflatten(0, following.shape[:2])
+            for network in (learner.network, learner.target)
+        )
+    assert (own.argmax(-1) != slow.argmax(-1)).any()  # so that it matters
+    best = slow.gather(-1, own.argmax(-1, keepdim=True))[..., 0]  # (B, T), of agents (B, T, N)
+    shape = (*batch.rewards.shape, *[1] * (best.dim() - 2))
+    ended = torch.from_numpy(batch.terminated).view(shape)
+    expected = torch.where(ended, 0.0, learner.goal(0.0).discount * best)
+    torch.testing.assert_close(targets, expected + torch.from_numpy(batch.rewards).view(shape))
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_learner_acts_like_the_policy_that_is_kept(preset):
+    """Greedy actions are those of the trained network, whatever the target network thinks."""
+    args = preset_options(Args, preset, n_agents=2, n_landmarks=2, hidden_units=8)
+    learner = MetaLearner(args, SQUARE, Streams.spawn(0))
+    other = MetaLearner(args, SQUARE, Streams.spawn(1))
+    learner.target.load_state_dict(other.network.state_dict())
+    seen = np.random.default_rng(0).integers(0, 2, (40, 6)).astype(np.float32)
+    acted = np.array([learner.act(row) for row in seen])
+    np.testing.assert_array_equal(acted, learner.policy().act(seen))
+    assert (acted != other.policy().act(seen)).any()
+
+
 # -- memory ------------------------------------------------------------------------------------
 
 
