@@ -193,6 +193,24 @@ def test_limits_are_as_documented(case: str) -> None:
     assert re.search(rf"\b({limit}|{limit + 1})\b", str(caught.value))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "size"),
+    [
+        ({}, 4 * 13),
+        ({"observation": "own_first"}, 3 * 4 * 13),
+        ({"observation": "planes"}, 3 * 4 * 6 * 49),
+        ({"grid": mapp_env.Grid(np.zeros((64, 65), bool)), "reward": "geodesic"}, 4 * 5 * 64 * 65),
+    ],
+)
+def test_a_gibibyte_is_allowed(arguments: dict[str, Any], size: int) -> None:
+    """As many rows as fit in 1 GiB of observations, or of distances, are allowed, and no more."""
+    task = Task(**{"grid": PAPER, **arguments})
+    rows = (1 << 30) // size
+    task.check_memory(rows)
+    with pytest.raises(ValueError, match=f"would take {(rows + 1) * size} bytes"):
+        task.check_memory(rows + 1)
+
+
 def test_the_largest_file_is_read(tmp_path: Path) -> None:
     """A map file of exactly a mebibyte is read, one of a byte more is not."""
     path = tmp_path / "large.map"
