@@ -171,6 +171,15 @@ def test_weights_decay_with_the_step_size(decay):
     torch.testing.assert_close(last[:, 0].detach(), start * (1 - 0.1 * decay) ** 3)
 
 
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_target_network_starts_as_a_copy(preset):
+    """Of the meta-agent and of each learner of its own."""
+    meta = MetaLearner(preset_options(Args, preset), SQUARE, Streams.spawn(0))
+    team = IndependentLearners(preset_options(IndependentArgs, preset), SQUARE, Streams.spawn(0))
+    for learner in (meta, *team.learners):
+        assert all(map(torch.equal, learner.target_weights, learner.weights))
+
+
 def test_target_network_is_copied_or_follows():
     """It is a copy every so many updates, or moves by its rate towards the network at each."""
     learner = paper_learner(0, 1, batch_size=4, target_interval=3)
