@@ -1045,3 +1045,30 @@ def test_grids_of_other_depots_are_others() -> None:
     env = mapp_v0.parallel_env(grid=here, n_landmarks=1)
     with pytest.raises(ValueError, match=r"options\['problem'\]"):
         env.reset(options={"problem": mapp_env.Problem(there, (4,))})
+
+
+def test_a_cell_twice_in_a_row_of_a_batch() -> None:
+    """Landmarks of each row are distinct, wherever in the row the same cell stands again."""
+    envs = mapp_env.make_vec(2, n_landmarks=3)
+    for row in ([6, 6, 0], [6, 0, 6], [0, 6, 6]):
+        with pytest.raises(ValueError, match=r"options\['landmarks'\]\[1\]"):
+            envs.reset(options={"landmarks": np.array([[0, 1, 2], row])})
+
+
+def test_no_step_before_the_first_reset() -> None:
+    """Without an episode there is none to step, not even with no actions; after one, nothing is."""
+    env = mapp_v0.parallel_env(max_cycles=1)
+    for actions in ({}, {"agent_0": 0}):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step(actions)
+    env.reset(seed=0)
+    env.step(dict.fromkeys(env.agents, 0))
+    assert env.step({}) == ({}, {}, {}, {}, {})
+
+
+def test_nothing_is_reached_from_a_wall() -> None:
+    """Distances from a wall are -1 to every cell, the wall itself included."""
+    grid = mapp_env.Grid.from_text("D#.\n...")
+    assert grid.distances_from([1]).tolist() == [[-1] * 6]
+    assert grid.distances_from([0, 1])[0].tolist() == [0, -1, 4, 1, 2, 3]
+    assert grid.distances[1].tolist() == [-1] * 6

@@ -353,3 +353,14 @@ def test_curves_are_those_of_the_episodes(tmp_path, monkeypatch):
         assert line.get_ydata() == pytest.approx(np.full(121, 50.0))
     assert {float(x) for line in shares.lines for x in np.ravel(line.get_xdata())} == {50.0}
     assert {float(x) for line in gaps.lines for x in np.ravel(line.get_xdata())} == {8.0}
+
+
+def test_hidden_files_of_others_are_left_alone(tmp_path):
+    """Only what a training itself had begun to write is cleared away."""
+    other = tmp_path / "paper-meta-seed0"
+    other.mkdir()
+    (other / ".config.json.abc").write_text("{")
+    (other / ".notes").write_text("years of work")
+    with pytest.raises(ValueError, match=r"holds something else: \.notes"):
+        compare.main(tiny(tmp_path), WORDS)
+    assert (other / ".notes").read_text() == "years of work"

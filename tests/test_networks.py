@@ -14,6 +14,7 @@ from baselines.networks import (
     NetworkSpec,
     build_network,
     greedy_actions,
+    linear,
     split_joint,
     torch_generator,
 )
@@ -362,3 +363,15 @@ def test_landmarks_among_one_another():
         [2 * 5 + 2, 2 * 5 + 4],
         [4 * 5 + 2, 4 * 5 + 4],
     ]
+
+
+def test_start_values_are_scaled_by_the_inputs():
+    """A layer's start values spread evenly up to 1 / sqrt(inputs), as PyTorch's own do."""
+    generator = torch.Generator().manual_seed(0)
+    for n_in, n_out in ((400, 25), (25, 400)):
+        layer = linear(n_in, n_out, generator)
+        bound = n_in**-0.5
+        for weights in (layer.weight, layer.bias):
+            assert weights.abs().max() <= bound
+        assert layer.weight.abs().max() > 0.99 * bound
+        assert float(layer.weight.detach().std()) == pytest.approx(bound / 3**0.5, rel=0.05)

@@ -357,3 +357,16 @@ def test_missing_pyvrp_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ImportError, match=r"pip install \"pyvrp>=0.14,<0.15\""):
         solve_pyvrp(random_problem(0), "makespan")
     assert solve_search(random_problem(0), "makespan", iterations=1).routes
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_agents_without_a_tour_come_last(objective: str) -> None:
+    """Of a larger team than there is work for, the first agents walk, and nobody has to wait."""
+    grid = make_grid()
+    for seed in range(6):
+        cells = sample_problems(grid, 1, n_landmarks=4, seed=seed)[0].tolist()
+        plan = solve(Problem(grid, cells, 9), objective, "search", seed=seed)
+        walking = [bool(tour) for tour in plan.tours]
+        assert walking == sorted(walking, reverse=True)
+        assert not walking[-1]
+        assert plan.joint_actions().max() < 4
