@@ -997,38 +997,6 @@ def test_a_refused_step_of_a_batch_changes_nothing(mode: str) -> None:
         assert all(map(np.array_equal, *results))
 
 
-def test_memory_is_counted_in_bytes() -> None:
-    """A GiB of observations, or of distance fields, may be asked for, and no byte more."""
-    large = mapp_env.Grid(np.zeros((64, 65), bool))
-    for arguments, each in (
-        ({"grid": PAPER, "observation": "planes"}, 4 * 3 * 6 * 49),
-        ({"grid": PAPER, "observation": "own_first"}, 4 * 3 * 13),
-        ({"grid": PAPER}, 4 * 13),
-        ({"grid": large, "reward": "geodesic"}, 4 * 5 * 64 * 65),
-    ):
-        task = Task(**arguments)
-        most = (1 << 30) // each
-        task.check_memory(most)
-        with pytest.raises(ValueError, match="allowed are 1073741824"):
-            task.check_memory(most + 1)
-
-
-LETTERS = {"#": "wall", "@": "wall", "T": "wall", "O": "wall", ".": "free", "G": "free"}
-
-
-@pytest.mark.parametrize("header", [False, True])
-@pytest.mark.parametrize("letter", [*"#@TO.GSWXs"])
-def test_letters_of_maps(letter: str, header: bool) -> None:
-    """Each letter is a wall, free or refused; swamp and water are known below a header alone."""
-    text = ("type octile\nheight 1\nwidth 3\nmap\n" if header else "") + f"D.{letter}"
-    meaning = {**LETTERS, **({"S": "free", "W": "wall"} if header else {})}.get(letter)
-    if meaning is None:
-        with pytest.raises(ValueError, match="column 3"):
-            mapp_env.Grid.from_text(text)
-    else:
-        assert mapp_env.Grid.from_text(text).walls.tolist() == [[False, False, meaning == "wall"]]
-
-
 def test_rows_of_a_map_begin_below_one_another() -> None:
     """Indentation that all rows share is none; a row that begins elsewhere is refused."""
     assert mapp_env.Grid.from_text("\n   D.\n   ..\n").walls.shape == (2, 2)
