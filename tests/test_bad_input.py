@@ -1040,3 +1040,13 @@ def test_nothing_is_reached_from_a_wall() -> None:
     assert grid.distances_from([1]).tolist() == [[-1] * 6]
     assert grid.distances_from([0, 1])[0].tolist() == [0, -1, 4, 1, 2, 3]
     assert grid.distances[1].tolist() == [-1] * 6
+
+
+@pytest.mark.parametrize("face", FACES)
+def test_a_reset_takes_one_wish(face: str) -> None:
+    """A problem and landmarks at once are refused, also if they say the same."""
+    env = FACES[face]()
+    cells = (0, 6, 20, 42, 48)
+    options = {"problem": mapp_env.Problem(PAPER, cells), "landmarks": cells}
+    with pytest.raises(ValueError, match="'problem' or 'landmarks', got both"):
+        env.reset(seed=0, options=options)

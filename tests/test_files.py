@@ -772,3 +772,14 @@ def test_a_vehicle_has_room_for_all(tmp_path: Path, n_agents: int) -> None:
     demands = [int(line.split()[1]) for line in lines[start + 1 : end]]
     assert demands == [0, 1, 1, 1, 1, 1]
     assert capacity >= sum(demands)
+
+
+def test_no_file_is_written_that_is_too_large_to_be_read(tmp_path: Path) -> None:
+    """Exactly as many bytes as may be read are written; of one more nothing is, by name."""
+    target = tmp_path / "a.txt"
+    write_text(target, "x" * 100, 100)
+    assert target.stat().st_size == 100
+    for text in ("y" * 101, "é" * 51):
+        with pytest.raises(FileError, match=r"a\.txt: would have 10[12] bytes, allowed are 100"):
+            write_text(target, text, 100)
+        assert target.read_text() == "x" * 100

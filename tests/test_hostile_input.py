@@ -199,3 +199,15 @@ def test_changed_rules_are_compiled_anew(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert play() == first - 1000
+
+
+@pytest.mark.parametrize("copier", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_copies_of_a_grid_keep_its_depot(copier: Callable[[Any], Any]) -> None:
+    """Wherever the depot is, a copy has it there, and so have problems and environments on it."""
+    for depot in (0, 5, 11):
+        grid = mapp_env.Grid(np.zeros((3, 4), bool), depot)
+        assert copier(grid).depot == depot
+        assert copier(grid) == grid
+        assert copier(mapp_env.Problem(grid, (1,))).grid.depot == depot
+        env = copier(mapp_v0.parallel_env(grid=grid, n_landmarks=1))
+        assert env.reset(seed=0)[0]["agent_0"][:3].tolist() == [depot] * 3

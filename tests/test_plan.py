@@ -268,3 +268,16 @@ def test_tours_that_leave_a_landmark_are_walked_to_their_end() -> None:
     actions = walk_tours(LINE, tours)  # nobody comes to cell 4
     assert actions.tolist() == [[1, 1], [0, 1], [0, 0], [0, 0]]
     assert walk_tours(LINE, ((), ())).shape == (0, 2)
+
+
+def test_a_plan_may_take_longer_than_an_episode() -> None:
+    """A plan is checked, kept and compared whatever the step limit of its problem."""
+    problem = Problem(make_grid(), (0, 6, 20, 42, 48), 3, max_cycles=2)
+    plan = solve(problem)
+    assert plan.cover_time > 2
+    plan.verify()
+    by_hand = Plan(plan.tours, plan.claims, plan.cover_time, plan.makespan, plan.total_distance)
+    by_hand.verify(problem)
+    assert (
+        Plan(**{**by_hand.__dict__, "problem": problem}).to_record()["problem"]["max_cycles"] == 2
+    )

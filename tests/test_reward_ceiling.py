@@ -178,3 +178,16 @@ def test_table_has_a_row_for_each_reward(capsys):
         cells = [cell.strip() for cell in line.split("|")[1:-1]]
         low, high = map(float, cells[3].split(" - "))
         assert low <= float(cells[2]) <= high
+
+
+def test_the_mean_lies_between_the_extremes():
+    """Ties at random are no better than at their best, no worse than at their worst.
+
+    However many ways lead to one state, no probability is lost on the way.
+    """
+    setting = Setting(Grid.from_text("...\n.D.\n..."), 2, 2, 30)
+    for landmarks in unseen_problems(setting, 12).tolist():
+        for reward in REWARDS:
+            (times,) = study(setting, [landmarks], reward, 0.9)
+            assert times.best <= times.at_random + 1e-9
+            assert times.at_random <= times.worst + 1e-9
