@@ -570,3 +570,13 @@ def test_copies_on_large_grids_go_on_alone(face: str) -> None:
     first = str(play(env, 2))
     assert str(play(twin, 2)) == first
     assert str(play(twin, 3)) == str(play(env, 3)) != first
+
+
+def test_paths_prefer_the_first_action() -> None:
+    """Of equally short paths the one is taken that goes left, right, up, down as soon as it can."""
+    grid = mapp_env.Grid(np.zeros((3, 3), bool))
+    assert grid.path(0, 8) == (0, 1, 2, 5, 8)
+    assert grid.path(8, 0) == (8, 7, 6, 3, 0)
+    assert grid.path(2, 6) == (2, 1, 0, 3, 6)
+    assert grid.path(6, 2) == (6, 7, 8, 5, 2)
+    assert grid.path(0, grid.depot) == (0, 1, 4)
