@@ -626,6 +626,32 @@ def test_a_row_has_the_influences_of_its_episode():
     assert [row["guidance"] for row in rows] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
 
 
+def test_guidance_is_that_of_the_episode():
+    """Where all obey in the first episode and nobody in the second, just that is played."""
+    args = preset_options(
+        Args,
+        "paper",
+        guidance_start=1.0,
+        guidance_end=0.0,
+        guidance_fraction=0.5,
+        n_problems=1,
+        episodes_per_problem=2,
+        max_cycles=40,
+    )
+    learner = Recorder(args, make_grid(), Streams.spawn(0))
+    training = Training(args, make_grid(), np.array([[17, 22, 25, 31, 48]]), learner)
+    obeyed = []
+    while not training.finished:
+        first, seen = not training.now.episodes, training.observation[None]
+        training.advance()
+        directions = training.guidance.directions(seen)[0]
+        taken = learner.told[-1][0]
+        obeyed += [(first, same) for same in (taken == directions)[directions >= 0].tolist()]
+    assert all(same for first, same in obeyed if first)
+    assert not all(same for first, same in obeyed if not first)
+    assert len({first for first, _ in obeyed}) == 2
+
+
 @pytest.mark.parametrize("preset", ["default", "paper"])
 def test_training_leaves_the_global_generators_alone(preset):
     """Neither NumPy's nor PyTorch's global generator moves, whatever is trained."""

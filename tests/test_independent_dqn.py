@@ -120,6 +120,18 @@ def test_shared_parameters(preset):
     for agent in range(3):
         stored = memory.arrays.observations[agent]
         np.testing.assert_array_equal(stored, view(transition[0], agent, team.spec))
+        following = memory.arrays.next_observations[agent, 0]
+        np.testing.assert_array_equal(following, view(transition[3], agent, team.spec))
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_as_much_is_kept_of_each_agent(preset):
+    """Learners that share a network remember of each agent what one learning alone does."""
+    for share, learners, capacity in ((False, 3, 70), (True, 1, 210)):
+        team = make(preset, share_parameters=share, memory_size=70)
+        replays = [learner.replay for learner in team.learners]
+        found = [getattr(replay, "memory", replay).capacity for replay in replays]
+        assert found == [capacity] * learners
 
 
 @pytest.mark.parametrize("kind", ["paper", "pairs"])
@@ -215,6 +227,28 @@ def test_no_target_is_above_what_the_rules_can_bring(share, gap):
             taken = here[np.arange(len(here)), batch.actions[:, 0, 0]]
             expected = batch.rewards[:, 0] + going_on - gap * (here.max(axis=1) - taken)
             np.testing.assert_allclose(targets[:, 0], expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("double", [False, True])
+@pytest.mark.parametrize(("progress", "discount"), [(0.0, 0.95), (0.5, 0.98)])
+def test_targets_look_ahead_as_far_as_is_said(double, progress, discount):
+    """By the final discount in the end; with double DQN along the trained network's choice."""
+    team = make("default", double=double, action_gap=0.0)
+    other = make("default", seed=1)
+    for transition in walk(np.random.default_rng(0), 200):
+        team.remember(*transition)
+    for learner, slow in zip(team.learners, other.learners, strict=True):
+        learner.target.load_state_dict(slow.network.state_dict())
+        with torch.no_grad():
+            learner.target.head.value.bias.fill_(-5.0)  # below what the rules can bring
+        batch, targets = learner.prepare(progress)
+        following = torch.from_numpy(batch.next_observations[:, 0])
+        with torch.no_grad():
+            own, values = learner.network(following)[:, 0], learner.target(following)[:, 0]
+        assert (own.argmax(1) != values.argmax(1)).any()
+        chosen = (own if double else values).argmax(1, keepdim=True)
+        follows = discount * values.gather(1, chosen).numpy() * ~batch.terminated
+        np.testing.assert_allclose(targets, batch.rewards + follows, rtol=1e-5)
 
 
 # -- relabelled replay -------------------------------------------------------------------------
