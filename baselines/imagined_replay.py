@@ -13,7 +13,7 @@ follow the learner's own policy: that is where its values will be used.
 """
 
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -71,6 +71,8 @@ class ImaginedReplay:
         Probability that an episode that was given up is begun again from the depot, with the same
         landmarks: so problems that the learner cannot solve stay until it can.
     """
+
+    CHANGING: ClassVar[tuple[str, ...]] = ("moves", "cells", "landmarks", "visited", "ages")
 
     def __init__(
         self,
@@ -212,13 +214,12 @@ class ImaginedReplay:
 
     def arrays_by_name(self) -> dict[str, np.ndarray]:
         """Return all that changes, for a checkpoint."""
-        names = ("moves", "cells", "landmarks", "visited", "ages")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in self.CHANGING}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`arrays_by_name` returned."""
-        for name, array in self.arrays_by_name().items():
-            setattr(self, name, take(arrays, name, array))
+        for name in self.CHANGING:
+            setattr(self, name, take(arrays, name, getattr(self, name)))
 
 
 def join(cells: np.ndarray, landmarks: np.ndarray, visited: np.ndarray) -> np.ndarray:

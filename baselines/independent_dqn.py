@@ -52,8 +52,9 @@ from baselines.networks import (
     view,
 )
 from baselines.options import Options, parse_options
+from baselines.own_imagined_replay import OwnImaginedReplay
 from baselines.policy import NetworkPolicy
-from baselines.q_learner import QLearner, next_values, td_targets
+from baselines.q_learner import Goal, QLearner, next_values, td_targets
 from baselines.relabelled_replay import RelabelledReplay
 from baselines.replay_memory import Batch, ReplayMemory
 from baselines.settings import N_ACTIONS
@@ -68,19 +69,22 @@ ALGORITHM = "independent_dqn"
 
 @dataclass(frozen=True)
 class Args(Options):
-    """Options of independent learners; those of imagined replay and joint values have no effect."""
+    """Options of independent learners; those of joint values have no effect."""
 
     OUTPUTS: ClassVar[tuple[str, ...]] = ("agents",)
-    REPLAYS: ClassVar[tuple[str, ...]] = ("relabelled", "stored")
+    REPLAYS: ClassVar[tuple[str, ...]] = ("relabelled", "imagined", "stored")
+    NETWORKS: ClassVar[tuple[str, ...]] = ("pairs", "paper", "geodesic")
 
-    network: Literal["pairs", "paper"] = "pairs"
+    network: Literal["pairs", "paper", "geodesic"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
-    landmarks as a set, agents in a fixed order (baselines/networks.py)"""
+    landmarks as a set, agents in a fixed order; "geodesic": the agent's own shortest paths, the
+    observation of that name, landmarks as a set (baselines/networks.py)"""
     outputs: Literal["agents"] = "agents"
     """a value for each action of the agent itself"""
-    replay: Literal["relabelled", "stored"] = "relabelled"
+    replay: Literal["relabelled", "imagined", "stored"] = "relabelled"
     """"stored": transitions as they were played; "relabelled": the agent's own transitions, most of
-    them with fresh landmarks (baselines/relabelled_replay.py)"""
+    them with fresh landmarks (baselines/relabelled_replay.py); "imagined": the agent's own moves
+    put together anew, the others as they were seen to go (baselines/own_imagined_replay.py)"""
 
     share_parameters: bool = False
     """whether all agents use one network, which learns from all of them"""
@@ -92,6 +96,8 @@ class Args(Options):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_flag("share_parameters", self.share_parameters)
+        if self.share_parameters and self.replay == "imagined":
+            raise ValueError("share_parameters must be False with replay 'imagined', got True")
         check_number("fresh_landmarks", self.fresh_landmarks, 0.0, 1.0)
         check_number("fresh_as_far", self.fresh_as_far, 0.0, 1.0)
 
@@ -114,6 +120,7 @@ def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Team:
         landmark_units=args.landmark_units,
         route_units=args.route_units,
         team="shared" if args.share_parameters else "independent",
+        grid=grid.to_text() if args.network == "geodesic" else "",
     )
     team = build_network(spec, generator)
     assert isinstance(team, Team)
@@ -150,6 +157,8 @@ class AgentLearner(QLearner):
         The grid.
     network, target
         One agent's networks.
+    agent
+        Which agent it is, if it is one agent's.
     n_sources
         Agents whose transitions it learns from: itself, or all that share the network.
     seeds
@@ -162,16 +171,33 @@ class AgentLearner(QLearner):
         grid: Grid,
         network: Network,
         target: Network,
+        agent: int,
         n_sources: int,
         seeds: np.random.SeedSequence,
     ) -> None:
         super().__init__(args, grid, network, target, np.random.default_rng(seeds))
         self.memory: ReplayMemory | None = None
         self.relabelled: RelabelledReplay | None = None
+        self.imagined: OwnImaginedReplay | None = None
         # Of each agent, as many transitions as are kept of it when it learns alone.
         capacity = n_sources * args.memory_size
         if args.replay == "stored":
             self.memory = ReplayMemory(capacity, self.spec.n_inputs, 1)
+        elif args.replay == "imagined":
+            self.imagined = OwnImaginedReplay(
+                self.spec,
+                agent,
+                grid.depot,
+                capacity,
+                args.fresh_landmarks,
+                args.batch_size,
+                args.tried_actions,
+                args.temperature,
+                args.imagined_exploration,
+                args.imagined_from_depot,
+                args.imagined_length,
+                args.imagined_retries,
+            )
         else:
             self.relabelled = RelabelledReplay(
                 self.spec, grid.depot, capacity, args.fresh_landmarks, args.fresh_as_far
@@ -192,22 +218,29 @@ class AgentLearner(QLearner):
             self.memory.add(observation, np.array([action]), reward, next_observation, terminated)
         if self.relabelled is not None:
             self.relabelled.remember(observation, action, next_observation)
+        if self.imagined is not None:
+            self.imagined.remember(observation, np.array([action]), next_observation)
 
     @property
     def ready(self) -> bool:
         """Whether there is something to learn from."""
-        return self.relabelled.ready if self.relabelled is not None else True
+        replay = self.replay
+        return True if isinstance(replay, ReplayMemory) else replay.ready
 
     @property
-    def replay(self) -> ReplayMemory | RelabelledReplay:
+    def replay(self) -> ReplayMemory | RelabelledReplay | OwnImaginedReplay:
         """What is learned from."""
         if self.memory is not None:
             return self.memory
+        if self.imagined is not None:
+            return self.imagined
         assert self.relabelled is not None
         return self.relabelled
 
     def prepare(self, progress: float) -> tuple[Batch, Tensor]:
         """Return a batch and the targets of its values."""
+        if self.imagined is not None:
+            return self.prepare_imagined(self.imagined, self.goal(progress))
         args = self.args
         with torch.no_grad():
             if self.memory is not None:
@@ -239,6 +272,29 @@ class AgentLearner(QLearner):
                 targets -= args.action_gap * (here[:, 0].amax(1, keepdim=True) - taken)
         return batch, targets
 
+    def prepare_imagined(self, imagined: OwnImaginedReplay, goal: Goal) -> tuple[Batch, Tensor]:
+        """Return imagined transitions, and the targets of their values."""
+        with torch.no_grad():
+            imagined.start_over(self.rng)
+            here = self.target(torch.from_numpy(imagined.observations()))
+            batch = imagined.draw(here[:, 0].numpy(), goal.reward, self.rng)
+            flat = batch.next_observations.reshape(-1, self.spec.n_inputs)
+            seen = torch.from_numpy(flat)
+            values = self.target(seen)
+            chooser = self.network(seen) if self.args.double else values
+            following = next_values(values, chooser, imagined.known_actions(flat))[:, 0]
+            targets = td_targets(
+                torch.from_numpy(batch.rewards.reshape(-1)),
+                torch.from_numpy(batch.terminated.reshape(-1)),
+                following.clamp(max=0.0),  # as above
+                goal.discount,
+            ).view(*batch.rewards.shape)
+            if self.args.action_gap:
+                best = next_values(here, here, imagined.known_actions(batch.observations))
+                taken = chosen_values(here, torch.from_numpy(batch.actions))
+                targets -= self.args.action_gap * (best - taken)
+        return batch, targets
+
     def chosen(self, values: Tensor, actions: Tensor) -> Tensor:
         """Return the values of the agent's own actions taken."""
         return chosen_values(values, actions)
@@ -253,9 +309,9 @@ class IndependentLearners:
         targets = make_network(args, grid, torch.Generator()).members
         n_learners = len(self.network.members)
         self.learners = [
-            AgentLearner(args, grid, network, target, args.n_agents // n_learners, seeds)
-            for network, target, seeds in zip(
-                self.network.members, targets, streams.replay.spawn(n_learners), strict=True
+            AgentLearner(args, grid, network, target, agent, args.n_agents // n_learners, seeds)
+            for agent, (network, target, seeds) in enumerate(
+                zip(self.network.members, targets, streams.replay.spawn(n_learners), strict=True)
             )
         ]
 

@@ -16,9 +16,14 @@ from torch import Tensor, nn
 from baselines.bags import Bag
 from baselines.checks import check_choice, check_count, check_flag
 from baselines.lookups import arrange, between_landmarks, n_routes, routes
+from mapp_env import Grid
+from mapp_env.dynamics import ALL_PAIRS, cell_table
+from mapp_env.observation import N_FEATURES, Observation
+from mapp_env.row_loops import observe_rows
 
 MAX_WEIGHTS = 20_000_000  # numbers in a network: 76 MiB
 MAX_JOINT_ACTIONS = 1024
+MAX_PATH_CELLS = 4096  # the most cells for which a Grid keeps the distances of all pairs
 
 OUTPUTS = ("agents", "joint")
 TEAMS = ("one", "independent", "shared")
@@ -40,6 +45,7 @@ class NetworkSpec:
     landmark_units: int = 0  # of "pairs": numbers that describe a landmark among the agents
     route_units: int = 0  # of "pairs": numbers that describe an agent among pairs of landmarks
     team: str = "one"  # one network for all agents, one for each, or one that each uses by itself
+    grid: str = ""  # of "geodesic": the map whose shortest paths it sees
 
     def __post_init__(self) -> None:
         check_choice("kind", self.kind, tuple(NETWORKS))
@@ -56,6 +62,12 @@ class NetworkSpec:
         check_choice("team", self.team, TEAMS)
         if self.team != "one":
             check_choice("outputs", self.outputs, ("agents",))
+        if self.kind == "geodesic":
+            check_choice("team", self.team, ("independent", "shared"))
+            n_cells = Grid.from_text(self.grid).n_cells
+            check_count("n_cells", self.n_cells, n_cells, min(n_cells, MAX_PATH_CELLS))
+        else:
+            check_choice("grid", self.grid, ("",))
         if self.outputs == "joint" and self.n_joint_actions > MAX_JOINT_ACTIONS:
             raise ValueError(
                 f"outputs must be 'agents' for {self.n_agents} agents: 'joint' would have "
@@ -93,8 +105,9 @@ class NetworkSpec:
 
     @property
     def n_inputs(self) -> int:
-        """Numbers that one network of the team is given: shared, also whose turn it is."""
-        return self.observation_size + (self.n_agents if self.team == "shared" else 0)
+        """Numbers that one network of the team is given: some also whose turn it is (view)."""
+        told = self.team == "shared" or self.kind == "geodesic"
+        return self.observation_size + (self.n_agents if told else 0)
 
     @property
     def n_weights(self) -> int:
@@ -105,6 +118,9 @@ class NetworkSpec:
             last += (hidden + 1) * (shape[0] if len(shape) == 2 else 1)
         if self.kind == "paper":
             first = (self.n_inputs + 1) * hidden + (hidden + 1) * hidden
+        elif self.kind == "geodesic":
+            units = self.code_units
+            first = (N_FEATURES + 1) * units + (units + 1) * units + (units + 1) * hidden
         else:
             n_pairs = self.n_cells * (self.n_cells + 2)
             first = n_pairs * self.code_units
@@ -119,8 +135,8 @@ class NetworkSpec:
         return (self.n_agents if self.team == "independent" else 1) * (first + last)
 
     def as_dict(self) -> dict[str, int | str | bool]:
-        """Return the fields as a dictionary ready for JSON."""
-        return asdict(self)
+        """Return the fields as a dictionary ready for JSON, without a grid if there is none."""
+        return {name: value for name, value in asdict(self).items() if name != "grid" or value}
 
 
 class Head(nn.Module):
@@ -284,14 +300,69 @@ def _joint_actions_by_order(spec: NetworkSpec) -> Tensor:
     return table
 
 
-NETWORKS = {"paper": PaperNetwork, "pairs": PairsNetwork}
+class GeodesicNetwork(nn.Module):
+    """Sees one agent's shortest paths, the observation "geodesic", and landmarks as a set.
+
+    The global observation is turned into the agent's own view in here, by the environment's own
+    kernel. Each unvisited landmark's eight numbers go through two layers, the sum through a third:
+    to rename landmarks changes nothing, and where the visited ones stand does not matter.
+
+    It is always one agent's, and told which (:func:`view`): with equal paths the agent with the
+    lower index counts as nearer.
+    """
+
+    def __init__(self, spec: NetworkSpec, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        self.spec = spec
+        grid = Grid.from_text(spec.grid)
+        self.table, self.distances = cell_table(grid), grid.distances
+        units = spec.code_units
+        self.landmark = nn.Sequential(
+            linear(N_FEATURES, units, generator),
+            nn.ReLU(),
+            linear(units, units, generator),
+            nn.ReLU(),
+        )
+        self.hidden = linear(units, spec.hidden_units, generator)
+        self.head = Head(spec, generator)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """Return action values (B, 1, A) of what :func:`view` gives (B, N + 2K + N)."""
+        seen = torch.from_numpy(self.paths(observations.numpy()))
+        landmarks: Tensor = seen[:, :, :1] * self.landmark(seen)  # the visited ones count nothing
+        values: Tensor = self.head(torch.relu_(self.hidden(landmarks.sum(1))))
+        return values
+
+    def paths(self, observations: np.ndarray) -> np.ndarray:
+        """Return the agent's own view (B, K, 8) of what :func:`view` gives."""
+        spec, n_rows = self.spec, len(observations)
+        n, k = spec.n_agents, spec.n_landmarks
+        views = np.empty((n_rows, n, N_FEATURES * k), np.float32)
+        observe_rows(
+            observations[:, : n + 2 * k].astype(np.int32),
+            np.arange(n_rows),
+            n,
+            k,
+            int(Observation.GEODESIC),
+            self.table,
+            self.distances,
+            ALL_PAIRS,
+            views,
+            np.empty((n_rows, n, spec.n_actions), np.int8),
+        )
+        whose = observations[:, n + 2 * k :].argmax(axis=1)
+        own: np.ndarray = views[np.arange(n_rows), whose].reshape(n_rows, k, N_FEATURES)
+        return own
+
+
+NETWORKS = {"paper": PaperNetwork, "pairs": PairsNetwork, "geodesic": GeodesicNetwork}
 
 
 class Team(nn.Module):
     """Networks of agents that act for themselves: one for each agent, or one that each uses.
 
     An agent's network gives values of this agent's own actions. With one for each, all see the
-    observation as it is. A shared one is told whose turn it is (:func:`view`).
+    observation as it is, but for "geodesic". A shared one is told whose turn it is (:func:`view`).
     """
 
     def __init__(self, spec: NetworkSpec, generator: torch.Generator | None = None) -> None:
@@ -307,9 +378,7 @@ class Team(nn.Module):
         """Return each agent's action values (B, N, A) of global observations (B, N + 2K)."""
         values = []
         for agent in range(self.spec.n_agents):
-            seen = observations
-            if self.spec.team == "shared":
-                seen = torch.from_numpy(view(observations.numpy(), agent, self.spec))
+            seen = torch.from_numpy(view(observations.numpy(), agent, self.spec))
             values.append(self.members[agent % len(self.members)](seen))
         return torch.cat(values, dim=1)
 
@@ -320,17 +389,20 @@ def view(observations: np.ndarray, agent: int, spec: NetworkSpec) -> np.ndarray:
     A network of one's own gets them as they are. A shared one gets the agent's own cell first, the
     others' after it in the order of the agents, and at the end a 1 at the agent's place among N
     numbers: agents that stand on one cell, as all do at the start, can still act differently.
+    "geodesic" gets that 1 in any team, and the cells in the order of the agents.
     """
-    if spec.team != "shared":
+    if spec.n_inputs == spec.observation_size:
         return observations
     n = spec.n_agents
     whose = np.zeros((*observations.shape[:-1], n), observations.dtype)
     whose[..., agent] = 1
-    cells = np.roll(observations[..., :n], -agent, axis=-1)
+    cells = observations[..., :n]
+    if spec.kind != "geodesic":
+        cells = np.roll(cells, -agent, axis=-1)
     return np.concatenate((cells, observations[..., n:], whose), axis=-1)
 
 
-Network = PaperNetwork | PairsNetwork | Team
+Network = PaperNetwork | PairsNetwork | GeodesicNetwork | Team
 
 
 def linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:

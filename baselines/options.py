@@ -21,6 +21,7 @@ class Options:
 
     OUTPUTS: ClassVar[tuple[str, ...]] = ("joint", "agents")
     REPLAYS: ClassVar[tuple[str, ...]] = ("imagined", "stored")
+    NETWORKS: ClassVar[tuple[str, ...]] = ("pairs", "paper")
 
     preset: Literal["default", "paper"] = "default"
     """where the other options start from; "paper": section 5 of the paper, and for what it leaves
@@ -156,7 +157,7 @@ class Options:
         check_choice("preset", self.preset, ("default", "paper"))
         check_choice("reward", self.reward, REWARDS)
         check_choice("final_reward", self.final_reward, (*REWARDS, "same"))
-        check_choice("network", self.network, ("pairs", "paper"))
+        check_choice("network", self.network, self.NETWORKS)
         check_choice("outputs", self.outputs, self.OUTPUTS)
         check_choice("replay", self.replay, self.REPLAYS)
         for name in ("dueling", "double", "learning_rate_falls", "prefetch", "half_precision"):

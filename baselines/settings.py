@@ -105,3 +105,5 @@ def check_fits(spec: NetworkSpec, setting: Setting, folder: Path) -> None:
                 f"{folder}: {name} is {value} by {CONFIG_FILE}, and {getattr(spec, name)} by the "
                 "weights"
             )
+    if spec.grid and Grid.from_text(spec.grid) != setting.grid:
+        raise ValueError(f"{folder}: the grid is another one by {CONFIG_FILE} than by the weights")
