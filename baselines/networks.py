@@ -64,10 +64,15 @@ class NetworkSpec:
             check_choice("outputs", self.outputs, ("agents",))
         if self.kind == "geodesic":
             check_choice("team", self.team, ("independent", "shared"))
-            n_cells = Grid.from_text(self.grid).n_cells
-            check_count("n_cells", self.n_cells, n_cells, min(n_cells, MAX_PATH_CELLS))
-        else:
-            check_choice("grid", self.grid, ("",))
+            check_count("n_cells", self.n_cells, 2, MAX_PATH_CELLS)
+            try:
+                n_cells = Grid.from_text(self.grid).n_cells
+            except ValueError as error:
+                raise ValueError(f"grid must be a map, got {self.grid!r}: {error}") from error
+            if n_cells != self.n_cells:
+                raise ValueError(f"grid must have n_cells={self.n_cells} cells, got {n_cells}")
+        elif self.grid != "":
+            raise ValueError(f"grid must be '' for kind {self.kind!r}, got {self.grid!r}")
         if self.outputs == "joint" and self.n_joint_actions > MAX_JOINT_ACTIONS:
             raise ValueError(
                 f"outputs must be 'agents' for {self.n_agents} agents: 'joint' would have "

@@ -7,6 +7,7 @@ import pytest
 
 from baselines.imagined_replay import UNKNOWN, ImaginedReplay, relabelled_reward, try_actions
 from baselines.networks import NetworkSpec, split_joint
+from baselines.own_imagined_replay import OwnImaginedReplay
 from mapp_env import Grid, make_grid
 from mapp_env.dynamics import (
     ALL_PAIRS,
@@ -453,3 +454,258 @@ def test_arrays_of_another_replay_are_refused_by_name(name):
     for bad in (arrays[name][1:], arrays[name].astype(np.float64)):
         with pytest.raises(ValueError, match=f"^{name}: "):
             replay.restore({**arrays, name: bad})
+
+
+# -- one agent's own moves ---------------------------------------------------------------------
+
+
+def make_own(grid: Grid, n_agents: int, n_landmarks: int, agent: int, **changes: object):
+    """Return a replay of one agent that knows nothing yet."""
+    spec = NetworkSpec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, team="independent")
+    options = {
+        "capacity": 10_000,
+        "fresh": 0.7,
+        "n_rows": 24,
+        "n_tried": 2,
+        "temperature": 0.5,
+        "exploration": 0.3,
+        "from_depot": 0.5,
+        "max_length": 12,
+        "retries": 0.5,
+    }
+    return OwnImaginedReplay(spec, agent, grid.depot, **{**options, **changes})
+
+
+def walk(grid: Grid, n_agents: int, n_landmarks: int, rng: np.random.Generator, n_steps: int):
+    """Play random episodes of at most 15 steps; yield (observation, actions, next observation)."""
+    step = 0
+    for _ in range(n_steps):
+        if step == 0:
+            landmarks = rng.choice(grid.reachable, n_landmarks, replace=False)
+            seen = np.zeros(n_agents + 2 * n_landmarks, np.float32)
+            seen[:n_agents], seen[n_agents : n_agents + n_landmarks] = grid.depot, landmarks
+        actions = rng.integers(4, size=n_agents)
+        following, _, over = step_by_the_rules(grid, seen, actions, "step", n_agents)
+        yield seen, actions, following
+        step, seen = (0 if over or step == 14 else step + 1), following
+
+
+def own_round(replay: OwnImaginedReplay, reward, rng):
+    """Begin and draw once, with values that are chance."""
+    replay.start_over(rng)
+    return replay.draw(rng.normal(size=(len(replay.cells), 4)).astype(np.float32), reward, rng)
+
+
+@pytest.mark.parametrize(
+    ("name", "n_agents", "n_landmarks", "agent", "capacity"),
+    [
+        ("paper", 3, 5, 1, 10_000),
+        ("paper", 3, 5, 2, 70),
+        ("paper", 1, 1, 0, 10_000),
+        ("corridor", 2, 3, 1, 10_000),
+        ("rooms", 4, 2, 0, 40),
+        ("hall", 3, 6, 0, 100),
+    ],
+)
+@pytest.mark.parametrize("kind", REWARDS)
+def test_an_agent_imagines_its_own_moves_by_the_rules(
+    name, n_agents, n_landmarks, agent, capacity, kind
+):
+    """Its own move is one it made, the others' are seen ones; all else is the step kernel's.
+
+    Whatever the memory has forgotten meanwhile, or the episode that was being played.
+    """
+    grid = GRIDS[name]
+    rng = np.random.default_rng([n_agents, n_landmarks])
+    replay = make_own(grid, n_agents, n_landmarks, agent, capacity=capacity)
+    reward = relabelled_reward(grid, kind, 0.5)
+    own, seen = set(), [set() for _ in range(n_agents)]
+    ended = rounds = 0
+    for step, (before, actions, after) in enumerate(walk(grid, n_agents, n_landmarks, rng, 400)):
+        replay.remember(before, actions[[agent]], after)
+        own.add((before[agent], actions[agent], after[agent]))
+        for other in range(n_agents):
+            seen[other].add((before[other], after[other]))
+        if step < 60 or step % 17 or not replay.ready:
+            continue
+        rounds += 1
+        batch = own_round(replay, reward, rng)
+        ended += batch.terminated.sum()
+        for row, tried in product(range(24), range(2)):
+            here, there = batch.observations[row], batch.next_observations[row, tried]
+            assert not here[n_agents + n_landmarks :].all()
+            assert (here[agent], batch.actions[row, tried, 0], there[agent]) in own
+            for other in set(range(n_agents)) - {agent}:
+                assert (here[other], there[other]) in seen[other]
+            cells = here[:n_agents].astype(int)
+            moves = grid.moves[cells] == there[:n_agents, None]  # some action of the others
+            moves[agent] = np.arange(4) == batch.actions[row, tried, 0]
+            following, expected, terminated = step_by_the_rules(
+                grid, here, moves.argmax(axis=1), kind, n_agents
+            )
+            np.testing.assert_array_equal(there, following)
+            assert batch.rewards[row, tried] == 0.5 * expected
+            assert batch.terminated[row, tried] == terminated
+            # Where landmarks can be, all different, and none that is unvisited under an agent.
+            landmarks = here[n_agents : n_agents + n_landmarks].astype(int)
+            assert len(set(landmarks.tolist()) - {grid.depot}) == n_landmarks
+            assert (here[n_agents + n_landmarks :] >= np.isin(landmarks, cells)).all()
+        # The episodes go on from one of the actions tried.
+        state = replay.observations()
+        assert (state[:, None] == batch.next_observations).all(axis=2).any(axis=1).all()
+    assert rounds > 10
+    assert ended > 0
+
+
+def test_the_others_go_along_what_was_seen():
+    """From the depot together as in one episode; each on along its stretch, and then another."""
+    grid = GRIDS["paper"]
+    rng = np.random.default_rng(0)
+    replay = make_own(grid, 3, 5, 1, from_depot=1.0, max_length=40, retries=0.0)
+    first, on, last = set(), [set(), set(), set()], [set(), set(), set()]
+    previous = None
+    for before, actions, after in walk(grid, 3, 5, rng, 600):
+        replay.remember(before, actions[[1]], after)
+        begins = previous is None or (previous[1] != before).any()
+        if begins:
+            first.add((*after[[0, 2]],))
+        for other in (0, 2):
+            if begins and previous is not None:
+                last[other].add((previous[0][other], previous[1][other]))
+            elif not begins:
+                on[other].add((previous[0][other], before[other], after[other]))
+        previous = before, after
+    for other in (0, 2):
+        last[other].add((previous[0][other], previous[1][other]))
+    reward = relabelled_reward(grid, "step", 1.0)
+    came_from = None
+    changed = 0
+    for _ in range(60):
+        ages = replay.ages.copy()
+        batch = own_round(replay, reward, rng)
+        here, there = batch.observations[:, :3], batch.next_observations[:, 0, :3]
+        for row in range(24):
+            if (here[row] == grid.depot).all() and replay.ages[row] == 1:
+                assert (*there[row, [0, 2]],) in first
+            elif came_from is not None and replay.ages[row] == ages[row] + 1:
+                for other in (0, 2):
+                    if (came_from[row, other], here[row, other], there[row, other]) in on[other]:
+                        continue
+                    assert (came_from[row, other], here[row, other]) in last[other]
+                    changed += 1
+        came_from = here
+    assert changed > 0
+
+
+@pytest.mark.parametrize("fresh", [0.0, 0.6, 1.0])
+def test_the_share_of_fresh_landmarks(fresh):
+    """Episodes are among the landmarks that the others met there, but for the fresh share."""
+    grid = GRIDS["paper"]
+    rng = np.random.default_rng(0)
+    replay = make_own(
+        grid, 3, 5, 1, n_rows=1000, fresh=fresh, from_depot=1.0, max_length=1, retries=0.0
+    )
+    played = {}
+    for before, actions, after in walk(grid, 3, 5, rng, 600):
+        replay.remember(before, actions[[1]], after)
+        if (before[[0, 1, 2]] == grid.depot).all():
+            played.setdefault((*after[[0, 2]],), set()).add(tuple(before[3:8]))
+    batch = own_round(replay, relabelled_reward(grid, "step", 1.0), rng)
+    kept = [
+        tuple(here[3:8]) in played[(*there[[0, 2]],)]
+        for here, there in zip(batch.observations, batch.next_observations[:, 0], strict=True)
+    ]
+    assert np.mean(kept) == pytest.approx(1.0 - fresh, abs=0.05)
+
+
+def test_own_episodes_begin_and_begin_again():
+    """Those given up begin again from the depot with their landmarks, for a share of them.
+
+    The others begin from the depot with all landmarks unvisited, for a share of these, or anywhere.
+    """
+    grid = GRIDS["paper"]
+    rng = np.random.default_rng(0)
+    replay = make_own(
+        grid, 3, 5, 1, n_rows=2000, fresh=1.0, from_depot=0.6, max_length=3, retries=0.7
+    )
+    for before, actions, after in walk(grid, 3, 5, rng, 1000):
+        replay.remember(before, actions[[1]], after)
+    reward = relabelled_reward(grid, "step", 1.0)
+
+    def begin():
+        rows = replay.start_over(rng)
+        at_depot = (replay.cells[rows] == grid.depot).all(axis=1)
+        return rows, at_depot & ~replay.visited[rows].any(axis=1)
+
+    rows, from_depot = begin()
+    assert len(rows) == 2000
+    assert from_depot.mean() == pytest.approx(0.6, abs=0.05)
+    assert len(set(replay.cells[~from_depot, 1].tolist())) > 30
+    assert set(replay.visited[~from_depot].sum(axis=1).tolist()) >= {0, 1, 2, 3, 4}
+    for _ in range(3):
+        replay.draw(rng.normal(size=(2000, 4)).astype(np.float32), reward, rng)
+    landmarks, solved = replay.landmarks.copy(), replay.visited.all(axis=1)
+    assert 0 < solved.sum() < 2000
+    rows, from_depot = begin()
+    assert len(rows) == 2000
+    same = (replay.landmarks == landmarks).all(axis=1)
+    assert not same[solved].any()
+    assert same[~solved].mean() == pytest.approx(0.7, abs=0.05)
+    assert from_depot[same].all()
+    assert from_depot[~same].mean() == pytest.approx(0.6, abs=0.07)
+
+
+@pytest.mark.parametrize("exploration", [0.0, 0.5])
+def test_own_best_action_is_tried_first_and_followed(exploration):
+    """The best of those the agent made there; a share of the episodes follows any that is tried."""
+    grid = GRIDS["paper"]
+    rng = np.random.default_rng(0)
+    replay = make_own(grid, 3, 5, 1, n_rows=2000, exploration=exploration)
+    made = np.zeros((49, 4), bool)
+    for before, actions, after in walk(grid, 3, 5, rng, 90):
+        replay.remember(before, actions[[1]], after)
+        made[int(before[1]), actions[1]] = True
+    assert not made[made.any(axis=1)].all()
+    reward = relabelled_reward(grid, "step", 1.0)
+    for _ in range(4):
+        replay.start_over(rng)
+        values = rng.normal(size=(2000, 4)).astype(np.float32)
+        batch = replay.draw(values, reward, rng)
+        known = made[batch.observations[:, 1].astype(int)]
+        best = np.where(known, values, -np.inf).argmax(axis=1)
+        np.testing.assert_array_equal(batch.actions[:, 0, 0], best)
+        several = known.sum(axis=1) > 1
+        np.testing.assert_array_equal(several, batch.actions[:, 1, 0] != best)
+        first, second = np.swapaxes(batch.next_observations, 0, 1)
+        state, apart = replay.observations(), (first != second).any(axis=1)
+        follows = (state == first).all(axis=1)
+        assert (follows | (state == second).all(axis=1)).all()
+        assert follows[apart].mean() == pytest.approx(1.0 - exploration / 2, abs=0.05)
+
+
+def test_own_restored_replay_goes_on_bit_for_bit():
+    """A replay that takes over another's arrays draws what the other does, and shares none."""
+    grid = GRIDS["rooms"]
+    reward = relabelled_reward(grid, "manhattan", 1.0)
+    first, rng = make_own(grid, 3, 2, 1, capacity=200), np.random.default_rng(0)
+    steps = list(walk(grid, 3, 2, rng, 330))
+    for before, actions, after in steps[:300]:
+        first.remember(before, actions[[1]], after)
+    for _ in range(9):
+        own_round(first, reward, rng)
+    second = make_own(grid, 3, 2, 1, capacity=200)
+    arrays = {name: array.copy() for name, array in first.arrays_by_name().items()}
+    second.restore(arrays)
+    drawn = []
+    for replay in (first, second):
+        own = np.random.default_rng(1)
+        drawn.append([])
+        for before, actions, after in steps[300:]:
+            replay.remember(before, actions[[1]], after)
+            drawn[-1].extend(array.tobytes() for array in own_round(replay, reward, own))
+    assert drawn[0] == drawn[1]
+    second.moves[:] = 0
+    assert (arrays["moves"] != 0).any()
+    for name in ("moments", "begins", "cells"):
+        with pytest.raises(ValueError, match=f"^{name}: "):
+            second.restore({**arrays, name: arrays[name][1:]})

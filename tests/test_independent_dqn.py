@@ -13,11 +13,13 @@ from baselines.networks import NetworkSpec, Team, build_network, torch_generator
 from baselines.options import preset_options
 from baselines.policy import WEIGHTS_KEY, load_policy, save_policy
 from baselines.relabelled_replay import RelabelledReplay
+from baselines.settings import Setting, check_fits
 from baselines.training import Streams
-from mapp_env import make_grid
+from mapp_env import Grid, make_grid, mapp_v0
 
 LEFT, RIGHT, UP, DOWN = range(4)
 GRID = make_grid("paper-7x7")
+IMAGINED, GEODESIC = {"replay": "imagined"}, {"network": "geodesic"}
 SMALL = {"hidden_units": 16, "code_units": 8, "batch_size": 16, "prefetch": False}
 
 
@@ -61,10 +63,13 @@ def weights_of(learners: IndependentLearners, index: int) -> list[np.ndarray]:
 # -- what a learner is told --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
-def test_a_learner_never_gets_anothers_action(preset):
+@pytest.mark.parametrize(
+    ("preset", "changes"),
+    [("default", {}), ("paper", {}), ("default", IMAGINED), ("default", GEODESIC)],
+)
+def test_a_learner_never_gets_anothers_action(preset, changes):
     """Whatever the others are said to have done, a learner's replay and weights are the same."""
-    one, other = make(preset), make(preset)
+    one, other = make(preset, **changes), make(preset, **changes)
     rng = np.random.default_rng(1)
     for before, actions, reward, after, over in walk(np.random.default_rng(0), 200):
         changed = np.append(actions[:1], rng.integers(4, size=2))
@@ -251,6 +256,42 @@ def test_targets_look_ahead_as_far_as_is_said(double, progress, discount):
         np.testing.assert_allclose(targets, batch.rewards + follows, rtol=1e-5)
 
 
+@pytest.mark.parametrize("network", ["pairs", "geodesic"])
+@pytest.mark.parametrize("gap", [0.0, 0.5])
+def test_targets_of_own_imagined_moves(network, gap):
+    """Each own action tried gets its reward and the best that follows of those the agent made.
+
+    At most 0, as the rules bring no more; less a share of what the action falls short of the best
+    one there, again of those that the agent made.
+    """
+    team = make("default", network=network, action_gap=gap, **IMAGINED)
+    made = [np.zeros((49, 4), bool) for _ in range(3)]
+    for before, actions, reward, after, over in walk(np.random.default_rng(0), 60):
+        team.remember(before, actions, reward, after, over)
+        for agent, table in enumerate(made):
+            table[int(before[agent]), actions[agent]] = True
+    n_unknown = 0
+    for agent, learner in enumerate(team.learners):
+        made[agent][~made[agent].any(axis=1)] = True  # nothing else to go by
+        for _ in range(3):
+            batch, targets = learner.prepare(0.0)
+            assert targets.shape == batch.actions.shape[:2] == (16, 2)
+            with torch.no_grad():
+                here = learner.target(torch.from_numpy(batch.observations))[:, 0].numpy()
+                flat = torch.from_numpy(batch.next_observations.reshape(32, -1))
+                there = learner.target(flat)[:, 0].numpy().reshape(16, 2, 4)
+            known = made[agent][batch.observations[:, agent].astype(int)]
+            next_known = made[agent][batch.next_observations[:, :, agent].astype(int)]
+            n_unknown += (~next_known).sum()
+            best = np.where(next_known, there, -np.inf).max(axis=2)
+            going_on = 0.95 * np.minimum(best, 0) * ~batch.terminated
+            taken = np.take_along_axis(here, batch.actions[:, :, 0], axis=1)
+            short = np.where(known, here, -np.inf).max(axis=1, keepdims=True) - taken
+            expected = batch.rewards + going_on - gap * short
+            np.testing.assert_allclose(targets, expected, rtol=1e-5, atol=1e-5)
+    assert n_unknown > 0
+
+
 # -- relabelled replay -------------------------------------------------------------------------
 
 
@@ -322,7 +363,8 @@ def test_drawing_leaves_what_was_experienced_alone():
     ("name", "value"),
     [
         ("outputs", "joint"),
-        ("replay", "imagined"),
+        ("replay", "owned"),
+        ("network", "planes"),
         ("share_parameters", 1),
         ("fresh_landmarks", 1.5),
         ("fresh_as_far", float("nan")),
@@ -335,6 +377,91 @@ def test_bad_options_are_refused_by_name(name, value):
         Args(**{name: value})
 
 
+def test_shared_parameters_do_not_imagine():
+    """What is imagined is one agent's."""
+    with pytest.raises(ValueError, match=r"^share_parameters must be False .*'imagined', got True"):
+        Args(share_parameters=True, replay="imagined")
+
+
+# -- the observation "geodesic" ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("team", ["independent", "shared"])
+@pytest.mark.parametrize("size", [(2, 3), (3, 5)])
+def test_a_network_sees_the_geodesic_observation(team, size):
+    """Each agent's network makes of the global observation what the env shows that agent."""
+    grid = make_grid("random", rows=6, cols=9, density=0.2, seed=3)
+    n_agents, n_landmarks = size
+    spec = NetworkSpec("geodesic", n_agents, n_landmarks, 4, 54, 16, team=team, grid=grid.to_text())
+    members = build_network(spec).members
+    env = mapp_v0.parallel_env(
+        grid=grid, n_agents=n_agents, n_landmarks=n_landmarks, observation="geodesic"
+    )
+    rng = np.random.default_rng(0)
+    for seed in range(3):
+        seen, _ = env.reset(seed=seed)
+        while env.agents:
+            for agent, name in enumerate(env.agents):
+                given = view(env.state()[None], agent, spec)
+                found = members[agent % len(members)].paths(given)
+                np.testing.assert_array_equal(found.ravel(), seen[name])
+            actions = rng.integers(4, size=n_agents).tolist()
+            seen, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
+
+
+def test_landmarks_are_a_set_to_the_geodesic_network():
+    """To rename landmarks changes nothing, nor does it matter where the visited ones stand."""
+    spec = NetworkSpec("geodesic", 3, 5, 4, 49, 16, team="independent", grid=GRID.to_text())
+    network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
+    seen, rng = observations(40), np.random.default_rng(1)
+    seen[:, :8] = rng.choice(GRID.reachable, (40, 8))
+    renamed, moved = seen.copy(), seen.copy()
+    for row in range(40):
+        order = rng.permutation(5)
+        renamed[row, 3:8], renamed[row, 8:] = seen[row, 3:8][order], seen[row, 8:][order]
+        visited = seen[row, 8:] > 0
+        moved[row, 3:8][visited] = rng.choice(GRID.reachable, visited.sum())
+    with torch.no_grad():
+        values, *others = (network(torch.from_numpy(x)) for x in (seen, renamed, moved))
+    for other in others:
+        torch.testing.assert_close(values, other)
+    assert len({tuple(row) for row in values[:, 0].tolist()}) > 30
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"grid": ""}, "grid must be a map, got ''"),
+        ({"grid": "D..\n..."}, "grid must have n_cells=49 cells, got 6"),
+        ({"n_cells": 5000}, "n_cells must be a whole number from 2 to 4096, got 5000"),
+        ({"team": "one"}, "team must be one of independent, shared, got 'one'"),
+        ({"kind": "pairs"}, "grid must be '' for kind 'pairs', got"),
+    ],
+)
+def test_a_network_on_paths_carries_its_grid(changes, message):
+    """The grid is that of the weights, and only that of a network that needs one."""
+    right = {"kind": "geodesic", "team": "independent", "grid": GRID.to_text()}
+    with pytest.raises(ValueError, match=message):
+        NetworkSpec(**{**right, "n_agents": 3, "n_landmarks": 5, "n_actions": 4, "n_cells": 49,
+                       "hidden_units": 8, **changes})  # fmt: skip
+
+
+def test_only_a_network_on_paths_says_its_grid():
+    """What is saved with any other network is what it was before there were such."""
+    assert "grid" not in make("default").spec.as_dict()
+    spec = make("default", **GEODESIC).spec
+    assert NetworkSpec(**spec.as_dict()) == spec
+
+
+def test_a_run_on_another_grid_than_its_weights_is_refused(tmp_path):
+    """Walls elsewhere, with as many cells: the paths would be wrong."""
+    spec = make("default", **GEODESIC).spec
+    check_fits(spec, Setting(GRID), tmp_path)
+    text = GRID.to_text().replace("#", ".", 1)
+    with pytest.raises(ValueError, match="the grid is another one"):
+        check_fits(spec, Setting(Grid.from_text(text)), tmp_path)
+
+
 # -- saved teams -------------------------------------------------------------------------------
 
 
@@ -343,6 +470,9 @@ SPECS = [
     for kind in ("paper", "pairs")
     for team in ("one", "independent", "shared")
     for dueling in (False, True)
+] + [
+    NetworkSpec("geodesic", 3, 5, 4, 49, 16, code_units=8, team=team, grid=GRID.to_text())
+    for team in ("independent", "shared")
 ]
 
 
@@ -359,11 +489,13 @@ def test_spec_counts_the_weights(spec):
     assert spec.n_weights == sum(weights.numel() for weights in network.parameters())
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize(
+    ("preset", "changes"), [("default", {}), ("paper", {}), ("default", GEODESIC)]
+)
 @pytest.mark.parametrize("share", [False, True])
-def test_loaded_team_acts_as_the_learners_do(tmp_path, preset, share):
+def test_loaded_team_acts_as_the_learners_do(tmp_path, preset, changes, share):
     """One file holds the networks of all agents, and gives the same actions."""
-    team = make(preset, share_parameters=share)
+    team = make(preset, share_parameters=share, **changes)
     save_policy(tmp_path / "policy.safetensors", team.policy().network)
     loaded = load_policy(tmp_path)
     assert loaded.spec == team.spec
@@ -374,7 +506,7 @@ def test_loaded_team_acts_as_the_learners_do(tmp_path, preset, share):
     np.testing.assert_array_equal(actions, [team.act(row) for row in seen])
     with torch.no_grad():
         for agent, member in enumerate(team.network.members):
-            if not share:
+            if not share and not changes:
                 own = member(torch.from_numpy(seen))[:, 0].argmax(dim=1).numpy()
                 np.testing.assert_array_equal(actions[:, agent], own)
 

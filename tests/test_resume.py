@@ -41,6 +41,13 @@ PRESETS = {
     "independent": {"updates_per_episode": 4, "max_cycles": 20},
     "independent-paper": {"memory_size": 40, "max_cycles": 20, "update_interval": 5},
     "shared": {"updates_per_episode": 6, "max_cycles": 20, "share_parameters": True},
+    "own-moves": {
+        "updates_per_episode": 4,
+        "max_cycles": 20,
+        "memory_size": 100,
+        "network": "geodesic",
+        "replay": "imagined",
+    },
 }
 
 
@@ -201,7 +208,7 @@ def test_killed_at_each_kind_of_moment_and_resumed(group, whole, tmp_path):
         assert results(args.out) == expected, kind
 
 
-KINDS = ("default", "paper", "double", "independent", "independent-paper", "shared")
+KINDS = ("default", "paper", "double", "independent", "independent-paper", "shared", "own-moves")
 
 
 @pytest.mark.parametrize("kind", KINDS)
