@@ -15,6 +15,12 @@ as close to the meta-agent's as an agent by itself can come:
 - ``paper``: a network on the plain numbers, replay of what was played, and the decaying guidance
   that points agents to close landmarks while training.
 
+Two options take away one difference to the meta-agent each, or add one: ``--network geodesic`` gives
+every agent its own shortest paths to look at (the observation of that name) in place of the 13
+numbers; ``--replay imagined`` recombines moves as the meta-agent's replay does, but only the
+agent's own. What the others do in imagined states is what the agent saw them do: the cells they
+went through in the episodes played, with no model of why (``own_imagined_replay.py``).
+
 Fairness: the same episodes, and for every network as many updates, of as many states, as the
 meta-agent's one network gets. In the default preset three learners take about twice the
 meta-agent's time, and learners that share their parameters about four fifths of it.
@@ -25,6 +31,7 @@ Paper: M. Cetinkaya, Multi-Agent Path Planning Using Deep Reinforcement Learning
 Command::
 
     python baselines/independent_dqn.py --seed 0
+    python baselines/independent_dqn.py --network geodesic --replay imagined
     python baselines/independent_dqn.py --preset paper --share-parameters
     python baselines/independent_dqn.py --resume runs/independent_dqn-default-seed0-...
 

@@ -557,11 +557,12 @@ def test_an_agent_imagines_its_own_moves_by_the_rules(
     assert ended > 0
 
 
-def test_the_others_go_along_what_was_seen():
+@pytest.mark.parametrize("capacity", [10_000, 250])
+def test_the_others_go_along_what_was_seen(capacity):
     """From the depot together as in one episode; each on along its stretch, and then another."""
     grid = GRIDS["paper"]
     rng = np.random.default_rng(0)
-    replay = make_own(grid, 3, 5, 1, from_depot=1.0, max_length=40, retries=0.0)
+    replay = make_own(grid, 3, 5, 1, capacity=capacity, from_depot=1.0, max_length=40, retries=0.0)
     first, on, last = set(), [set(), set(), set()], [set(), set(), set()]
     previous = None
     for before, actions, after in walk(grid, 3, 5, rng, 600):
@@ -595,6 +596,38 @@ def test_the_others_go_along_what_was_seen():
                     changed += 1
         came_from = here
     assert changed > 0
+
+
+def test_where_a_stretch_ends_any_other_goes_on():
+    """What was seen most often from a cell is what an agent there does most often."""
+    grid = GRIDS["paper"]
+    rng = np.random.default_rng(0)
+    replay = make_own(grid, 3, 5, 1, n_rows=4000, from_depot=1.0, max_length=2, retries=0.0)
+    seen = np.zeros((3, 49))
+    for before, actions, after in walk(grid, 3, 5, rng, 600):
+        replay.remember(before, actions[[1]], after)
+        for other in (0, 2):
+            seen[other, int(after[other])] += before[other] == grid.depot
+    replay.start_over(rng)
+    replay.moments[:] = UNKNOWN  # as if all had come to the depot at the end of theirs
+    batch = own_round(replay, relabelled_reward(grid, "step", 1.0), rng)
+    for other in (0, 2):
+        found = np.bincount(batch.next_observations[:, 0, other].astype(int), minlength=49)
+        np.testing.assert_allclose(found / 4000, seen[other] / seen[other].sum(), atol=0.04)
+
+
+def test_nothing_is_imagined_before_a_beginning_is_known():
+    """A memory too short for the episode that is played is not ready until the next begins."""
+    grid = GRIDS["paper"]
+    replay = make_own(grid, 3, 5, 1, capacity=10)
+    ready = []
+    for before, actions, after in walk(grid, 3, 5, np.random.default_rng(0), 300):
+        replay.remember(before, actions[[1]], after)
+        begins = (before[:3] == grid.depot).all()
+        ready = [replay.ready] if begins else [*ready, replay.ready]
+        if len(ready) > 10:
+            assert not replay.ready
+    assert ready[0]
 
 
 @pytest.mark.parametrize("fresh", [0.0, 0.6, 1.0])
