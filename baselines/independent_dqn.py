@@ -15,11 +15,11 @@ as close to the meta-agent's as an agent by itself can come:
 - ``paper``: a network on the plain numbers, replay of what was played, and the decaying guidance
   that points agents to close landmarks while training.
 
-Two options take away one difference to the meta-agent each, or add one: ``--network geodesic`` gives
-every agent its own shortest paths to look at (the observation of that name) in place of the 13
-numbers; ``--replay imagined`` recombines moves as the meta-agent's replay does, but only the
-agent's own. What the others do in imagined states is what the agent saw them do: the cells they
-went through in the episodes played, with no model of why (``own_imagined_replay.py``).
+Two options are for controlled comparisons: ``--network geodesic`` gives every agent its own
+shortest paths to look at (the observation of that name) in place of the 13 numbers; ``--replay
+imagined`` recombines moves as the meta-agent's replay does, but only the agent's own. What the
+others do in imagined states is what the agent saw them do: they go through the cells that they went
+through in the episodes played, whatever the landmarks are now (``own_imagined_replay.py``).
 
 Fairness: the same episodes, and for every network as many updates, of as many states, as the
 meta-agent's one network gets. In the default preset three learners take about twice the

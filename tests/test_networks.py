@@ -232,7 +232,7 @@ SMALL = {
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"kind": "deep"}, r"^kind must be one of paper, pairs, got 'deep'"),
+        ({"kind": "deep"}, r"^kind must be one of paper, pairs, geodesic, got 'deep'"),
         ({"n_agents": 0}, r"^n_agents must be .* from 1 to 16, got 0"),
         ({"n_agents": 17}, r"^n_agents must be .* from 1 to 16, got 17"),
         ({"n_landmarks": 257}, r"^n_landmarks must be .* got 257"),
