@@ -254,7 +254,8 @@ def without_effect(options: Options) -> dict[str, str]:
     o = options
     final = ("final_reward", "final_discount", "final_reward_scale")
     choices = (
-        ("network", o.network == "paper", ("code_units", "landmark_units", "route_units")),
+        ("network", o.network == "paper", ("code_units",)),
+        ("network", o.network != "pairs", ("landmark_units", "route_units")),
         ("replay", o.replay == "stored", ("action_gap", "final_from", *final)),
         (
             "replay",

@@ -810,6 +810,8 @@ def trained(kind, changes):
         (META, {"guidance_start": 0.5, "guidance_end": 0.5}),
         (INDEPENDENT, {}),
         (INDEPENDENT, {"replay": "stored"}),
+        (INDEPENDENT, {"replay": "imagined"}),
+        (INDEPENDENT, {"network": "geodesic"}),
     ],
 )
 def test_what_is_refused_as_without_effect_has_none(kind, choice):

@@ -129,16 +129,6 @@ def test_shared_parameters(preset):
         np.testing.assert_array_equal(following, view(transition[3], agent, team.spec))
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
-def test_as_much_is_kept_of_each_agent(preset):
-    """Learners that share a network remember of each agent what one learning alone does."""
-    for share, learners, capacity in ((False, 3, 70), (True, 1, 210)):
-        team = make(preset, share_parameters=share, memory_size=70)
-        replays = [learner.replay for learner in team.learners]
-        found = [getattr(replay, "memory", replay).capacity for replay in replays]
-        assert found == [capacity] * learners
-
-
 @pytest.mark.parametrize("kind", ["paper", "pairs"])
 @pytest.mark.parametrize("team", ["independent", "shared"])
 def test_agents_on_one_cell_can_part(kind, team):
