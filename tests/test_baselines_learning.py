@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from baselines import meta_dqn, q_learner
+from baselines.experiment import training_problems
 from baselines.guidance import Guidance, GuidedPolicy, LinearSchedule
 from baselines.independent_dqn import Args as IndependentArgs
 from baselines.independent_dqn import IndependentLearners
@@ -591,9 +592,9 @@ class Noting(MetaLearner):
         self.progress = []
 
     def update(self, progress):
-        """Keep it."""
+        """Keep it, and return how many there were."""
         self.progress.append(progress)
-        return 0.0
+        return float(len(self.progress))
 
 
 def rows_and_progress(preset, **changes):
@@ -614,6 +615,25 @@ def test_progress_rises_evenly():
     """An episode's updates are spread evenly over it: step sizes fall in a straight line."""
     _, _, progress = rows_and_progress("default", updates_per_episode=5)
     assert progress == pytest.approx([update / 30 for update in range(30)])
+
+
+def test_a_row_has_the_mean_loss_of_its_updates():
+    """With losses 1, 2, 3 ... and five updates an episode: 3, 8, 13 ..."""
+    _, rows, _ = rows_and_progress("default", updates_per_episode=5)
+    assert [row["loss"] for row in rows] == [3.0, 8.0, 13.0, 18.0, 23.0, 28.0]
+
+
+def test_no_two_draw_from_one_stream():
+    """Start weights, training problems, exploration and replay each have random numbers apart."""
+    args = Args(hidden_units=8)
+    streams = Streams.spawn(args.seed)
+    learner = MetaLearner(args, make_grid(), streams)
+    problems = training_problems(args, make_grid())
+    training = Training(args, make_grid(), problems, learner)
+    own = [np.random.default_rng(stream).random() for stream in streams]
+    assert len(set(own)) == len(streams)
+    drawn = {generator.random() for generator in (training.rng, learner.rng)}
+    assert len(drawn & set(own)) == 2
 
 
 def test_a_row_has_the_influences_of_its_episode():
