@@ -1050,3 +1050,12 @@ def test_a_reset_takes_one_wish(face: str) -> None:
     options = {"problem": mapp_env.Problem(PAPER, cells), "landmarks": cells}
     with pytest.raises(ValueError, match="'problem' or 'landmarks', got both"):
         env.reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize("pair", [(0, -1), (1, -1), (1, -7), (-1, 0), (7, 0), (0, 7), (3, 10**9)])
+def test_pairs_beside_the_grid(pair: tuple[int, int]) -> None:
+    """A row or column beside the grid is no cell, and means none of a neighbouring row."""
+    with pytest.raises(ValueError, match=r"landmarks\[0\] must be a cell .* within 7 x 7"):
+        mapp_env.Problem(PAPER, [pair])
+    with pytest.raises(ValueError, match="depot must be a cell"):
+        mapp_env.Grid(PAPER.walls, pair)

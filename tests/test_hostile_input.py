@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 import os
 import pickle
 import shutil
@@ -211,3 +212,23 @@ def test_copies_of_a_grid_keep_its_depot(copier: Callable[[Any], Any]) -> None:
         assert copier(mapp_env.Problem(grid, (1,))).grid.depot == depot
         env = copier(mapp_v0.parallel_env(grid=grid, n_landmarks=1))
         assert env.reset(seed=0)[0]["agent_0"][:3].tolist() == [depot] * 3
+
+
+def test_every_file_with_a_kernel_names_the_compiled_code(tmp_path: Path) -> None:
+    """Whichever file with compiled code is edited, the name that the cache goes by is another."""
+    package = tmp_path / "mapp_env"
+    shutil.copytree(
+        Path(mapp_env.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+    )
+    spec = importlib.util.spec_from_file_location("edited", package / "compiled.py")
+    assert spec is not None
+    assert spec.loader is not None
+    edited = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(edited)
+    names = {edited._digest_sources()}
+    files = [path for path in package.rglob("*.py") if "\n@kernel" in path.read_text("utf-8")]
+    assert len(files) > 8
+    for path in files:
+        path.write_text(path.read_text("utf-8") + "\n# edited\n", encoding="utf-8")
+        names.add(edited._digest_sources())
+    assert len(names) == len(files) + 1
