@@ -217,6 +217,17 @@ def test_start_values_follow_the_seed_and_nothing_else(kind, dueling):
         assert len(tensor.unique()) > 1 or tensor.numel() == 1
 
 
+@pytest.mark.parametrize(("n_in", "n_out"), [(13, 512), (40, 3)])
+def test_start_values_are_pytorchs(n_in, n_out):
+    """A layer starts as torch.nn.Linear does, drawn from a generator of its own."""
+    own = linear(n_in, n_out, torch.Generator().manual_seed(7))
+    with torch.random.fork_rng():
+        torch.manual_seed(7)
+        usual = torch.nn.Linear(n_in, n_out)
+    torch.testing.assert_close(own.weight, usual.weight)
+    torch.testing.assert_close(own.bias, usual.bias)
+
+
 # -- limits ------------------------------------------------------------------------------------
 
 SMALL = {
