@@ -1,5 +1,7 @@
 """Checkpoints: whole or not at all, and refused when anything about them is wrong."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -110,7 +112,7 @@ def test_missing_parts_are_noticed(tmp_path):
     (checkpoints.folder / f"{2:012d}.safetensors").unlink()
     loaded, problems = checkpoints.latest()
     assert loaded.number == 1
-    assert "000000000002.safetensors': cannot be opened as a checkpoint" in problems[0]
+    assert re.search(r"000000000002\.safetensors: .*cannot be opened as a checkpoint", problems[0])
     (checkpoints.folder / f"{2:012d}.json").unlink()
     assert checkpoints.latest()[1] == []
     (checkpoints.folder / f"{1:012d}.safetensors").unlink()

@@ -452,7 +452,7 @@ def test_arrays_of_another_replay_are_refused_by_name(name):
     replay = make_replay(GRIDS["rooms"], 2, 3)
     arrays = replay.arrays_by_name()
     for bad in (arrays[name][1:], arrays[name].astype(np.float64)):
-        with pytest.raises(ValueError, match=f"^{name}: "):
+        with pytest.raises(ValueError, match=f"^{name} must be "):
             replay.restore({**arrays, name: bad})
 
 
@@ -740,5 +740,5 @@ def test_own_restored_replay_goes_on_bit_for_bit():
     second.moves[:] = 0
     assert (arrays["moves"] != 0).any()
     for name in ("moments", "begins", "cells"):
-        with pytest.raises(ValueError, match=f"^{name}: "):
+        with pytest.raises(ValueError, match=f"^{name} must be "):
             second.restore({**arrays, name: arrays[name][1:]})

@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, Page
 from baselines.evaluation import evaluate
 from baselines.export_playground import PLAYGROUND, export
 from baselines.networks import NetworkSpec, build_network, torch_generator
-from baselines.policy import load_policy, save_policy
+from baselines.policy import PRETRAINED, load_policy, save_policy
 from baselines.settings import Setting
 from mapp_env import Plan, Problem, make_grid, replay, sample_problems, solve
 
@@ -118,6 +118,7 @@ def test_page_acts_as_the_policy(name, visit, tmp_path):
 def test_page_acts_as_the_rounded_policy(name, visit, tmp_path):
     """On as many problems as are asked for, with the same weights no action is another."""
     save_policy(tmp_path / "policy.safetensors", load_policy(name).network, half_precision=True)
+    shutil.copy(PRETRAINED / name / "config.json", tmp_path)  # which grid they are for
     page = visit(folder=page_with(export(name), tmp_path / "page"))
     for part in np.array_split(problems(N_ROUNDED), -(-N_ROUNDED // 500)):
         found = page.evaluate(PLAY, part.tolist())
