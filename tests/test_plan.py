@@ -68,6 +68,34 @@ def test_joint_actions_with_waits_cost_the_same() -> None:
     assert waits > 100
 
 
+def test_agents_wait_from_when_they_could_be_home() -> None:
+    """With waits, an agent acts as before until it had the time to walk home, and then stands."""
+    rng = np.random.default_rng(3)
+    late = 0
+    for _ in range(300):
+        problem, actions = random_walk(rng, 4)
+        plan = replay(problem, actions)
+        waiting = plan.joint_actions(allow_wait=True)
+        for agent, claims in enumerate(plan.claims):
+            home = 0
+            if claims:
+                home = plan.claim_steps[agent][-1] + int(problem.grid.home[claims[-1]])
+            before = np.array(plan.actions).reshape(waiting.shape)[:home, agent]
+            assert waiting[:home, agent].tolist() == before.tolist()
+            assert (waiting[home:, agent] == 4).all()
+            late += 0 < home < len(waiting)
+    assert late > 50
+
+
+def test_a_replay_ends_at_the_problems_limit() -> None:
+    """Actions beyond the problem's step limit are not carried out, landmarks there not visited."""
+    for limit, solved in ((2, False), (3, True), (4, True), (None, True)):
+        problem = dataclasses.replace(LINE, max_cycles=limit)
+        plan = replay(problem, [[1, 4]] * 5)
+        assert (plan.success, len(plan.actions)) == (solved, 3 if solved else 2)
+        assert plan.claims == ((2, 4) if solved else (2,), ())
+
+
 def test_joint_actions_refuse_what_they_cannot_say() -> None:
     """A plan that waits cannot be played without the action; one without actions not at all."""
     plan = replay(LINE, [[1, 4], [1, 4], [1, 4]])
@@ -75,8 +103,9 @@ def test_joint_actions_refuse_what_they_cannot_say() -> None:
     with pytest.raises(ValueError, match="agent 1 of this plan waits at step 0"):
         plan.joint_actions()
     by_hand = dataclasses.replace(plan, actions=(), claim_steps=(), problem=None)
-    with pytest.raises(ValueError, match="needs a plan from"):
-        by_hand.joint_actions()
+    for problem in (None, LINE):
+        with pytest.raises(ValueError, match="needs a plan from"):
+            dataclasses.replace(by_hand, problem=problem).joint_actions()
     nothing = replay(LINE, np.empty((0, 2), int))
     assert nothing.joint_actions().shape == (0, 2)
 
