@@ -123,9 +123,17 @@ class Killer:
         patch.setattr(files, "os", SimpleNamespace(**{**system, **calls}))
         patch.setattr(files, "_replace", watched)
         patch.setattr(runs, "os", SimpleNamespace(**system))
+        unlink = Path.unlink
+
+        def unlinked(path: Path, missing_ok: bool = False) -> None:
+            if path.parent.name == "checkpoints":
+                self.tick("unlink")
+            unlink(path, missing_ok)
+
+        patch.setattr(Path, "unlink", unlinked)
         for place, name in (
-            *((experiment.Training, "advance"), (Checkpoints, "save"), (Path, "unlink")),
-            *((RunFolder, "log"), (RunFolder, "restart"), (RunFolder, "write_config")),
+            *((experiment.Training, "advance"), (Checkpoints, "save"), (RunFolder, "log")),
+            *((RunFolder, "restart"), (RunFolder, "write_config")),
         ):
             patch.setattr(place, name, self.hooked(name, getattr(place, name)))
 
