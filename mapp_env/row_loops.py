@@ -25,7 +25,7 @@ __all__ = [
 
 
 @kernel
-def step_and_observe(
+def _step_and_observe(
     row: NDArray[np.int32],
     actions: NDArray[np.int64],
     max_cycles: int,
@@ -41,7 +41,10 @@ def step_and_observe(
     views: NDArray[np.float32],
     masks: NDArray[np.int8],
 ) -> tuple[float, bool, bool]:
-    """Step a row and look at it; parameters as in ``step_row`` and ``observe_row``."""
+    """Do what :func:`step_and_observe` does with actions that have been looked at.
+
+    The rules index a table with them, and what is no action would leave its memory.
+    """
     result: tuple[float, bool, bool] = step_row(
         row,
         actions,
@@ -59,6 +62,54 @@ def step_and_observe(
         n_landmarks,
         kind,
         table,
+        view_distances,
+        first_view_field,
+        views,
+        masks,
+    )
+    return result
+
+
+@kernel
+def step_and_observe(
+    row: NDArray[np.int32],
+    actions: NDArray[np.int64],
+    max_cycles: int,
+    n_agents: int,
+    n_landmarks: int,
+    reward: int,
+    kind: int,
+    table: NDArray[np.int32],
+    distances: NDArray[np.int32],
+    first_field: int,
+    view_distances: NDArray[np.int32],
+    first_view_field: int,
+    views: NDArray[np.float32],
+    masks: NDArray[np.int8],
+) -> tuple[float, bool, bool]:
+    """Step a row and look at it; parameters as in ``step_row`` and ``observe_row``.
+
+    Raises
+    ------
+    ValueError
+        If ``actions`` are not one an agent, each one that it has; nothing has moved then.
+    """
+    if actions.shape[0] != n_agents:
+        raise ValueError("actions must hold one action an agent")
+    for agent in range(n_agents):
+        if not 0 <= actions[agent] < masks.shape[1]:
+            raise ValueError("actions must be in 0..A-1, A the number of an agent's actions")
+    result: tuple[float, bool, bool] = _step_and_observe(
+        row,
+        actions,
+        max_cycles,
+        n_agents,
+        n_landmarks,
+        reward,
+        kind,
+        table,
+        distances,
+        first_field,
         view_distances,
         first_view_field,
         views,
@@ -108,7 +159,7 @@ def step_rows(
                 masks[index],
             )
         else:
-            rewards[index], terminations[index], truncations[index] = step_and_observe(
+            rewards[index], terminations[index], truncations[index] = _step_and_observe(
                 rows[index],
                 actions[index],
                 limits[index],

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from mapp_env.dynamics import row_length
 from mapp_env.problem import MAX_CYCLES
-from mapp_env.row_loops import fill_fields, measure_rows, observe_rows, reset_rows, step_rows
+from mapp_env.row_loops import (
+    fill_fields,
+    find_bad_action,
+    measure_rows,
+    observe_rows,
+    reset_rows,
+    step_rows,
+)
 from mapp_env.scene import TRAIL_MOVES, Scene
 from mapp_env.task import Task
 
@@ -59,6 +66,7 @@ class Rows:
         self.tables = self._find_tables()
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
+        self._looked_at: NDArray[np.int64] | None = None
         # Pictures show where agents have been: their cells at each step, for each row.
         self._trails: list[deque[tuple[int, ...]]] | None = None
         if task.render_mode is not None:
@@ -117,6 +125,15 @@ class Rows:
                 self._trails[index].clear()
             self.extend_trails(indices)
 
+    def find_bad_action(self, actions: NDArray[np.int64]) -> int:
+        """Return the position of the first action, shape (B, N), that is none, or -1.
+
+        If there is none, :meth:`step` will not look at the same array again.
+        """
+        position: int = find_bad_action(actions.reshape(-1).view(np.uint64), self.task.n_actions)
+        self._looked_at = actions if position < 0 else None
+        return position
+
     def step(
         self, actions: NDArray[np.int64], skip: NDArray[np.bool_]
     ) -> tuple[
@@ -141,7 +158,21 @@ class Rows:
             float64, bool, bool.
         views, masks : ndarray of float32, shape (B, V, F), and of int8, shape (B, N, A)
             Fresh observations, flat, and action masks.
+
+        Raises
+        ------
+        ValueError
+            If an action is not valid; nothing has moved then. The rules index a table with actions:
+            what no face has stopped would leave its memory.
         """
+        if actions is not self._looked_at and (
+            actions.shape != (self.n_rows, self.task.n_agents) or self.find_bad_action(actions) >= 0
+        ):
+            raise ValueError(
+                f"actions must be in 0..{self.task.n_actions - 1}, one for each of "
+                f"{self.task.n_agents} agents in each of {self.n_rows} rows"
+            )
+        self._looked_at = None
         rewards = np.empty(self.n_rows)
         terminations = np.empty(self.n_rows, np.bool_)
         truncations = np.empty(self.n_rows, np.bool_)

@@ -89,6 +89,11 @@ class Simulation:
             Of the team (R6, R7).
         views, masks : ndarray of float32, shape (V, ...), and of int8, shape (N, A)
             Fresh observations and action masks.
+
+        Raises
+        ------
+        ValueError
+            If an action is not valid; nothing has moved then.
         """
         views = np.empty(self._views_shape, np.float32)
         masks = np.empty(self._masks_shape, np.int8)

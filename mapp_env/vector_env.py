@@ -25,7 +25,7 @@ from mapp_env.row_seeds import RowSeeds
 from mapp_env.rows import Rows
 from mapp_env.task import Task, find_grid
 from mapp_env.validation import check_choice, check_count
-from mapp_env.vector_infos import Transition, add_masks, make_infos
+from mapp_env.vector_infos import Transition, add_joint_masks, make_infos
 
 try:
     from gymnasium.vector import AutoresetMode
@@ -204,8 +204,9 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self._started = True
         views, action_mask = self._rows.observe()
         action_mask[~mask] = 0
-        infos: dict[str, Any] = {}
-        add_masks(infos, action_mask, mask, self._n_joint_actions)
+        infos = {"action_mask": action_mask, "_action_mask": mask}
+        if self._n_joint_actions:
+            add_joint_masks(infos, self._n_joint_actions)
         return views.reshape(self._observations_shape), infos
 
     def step(
@@ -316,9 +317,12 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"actions must be integers of shape {shape}, "
                 f"got shape {array.shape} and dtype {array.dtype}"
             )
-        n_actions = self.task.n_actions if self.joint_actions is None else len(self.joint_actions)
         array = np.ascontiguousarray(array, np.int64)
-        bad = find_bad_action(array.reshape(-1).view(np.uint64), n_actions)
+        if self.joint_actions is None:
+            n_actions, bad = self.task.n_actions, self._rows.find_bad_action(array)
+        else:
+            n_actions = len(self.joint_actions)
+            bad = find_bad_action(array.view(np.uint64), n_actions)
         if bad >= 0:
             place = ", ".join(str(int(index)) for index in np.unravel_index(bad, shape))
             raise ValueError(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapp_env.row_loops import fill_joint_masks
 
-__all__ = ["Transition", "add_masks", "make_infos"]
+__all__ = ["Transition", "add_joint_masks", "make_infos"]
 
 
 class Transition(NamedTuple):
@@ -43,22 +43,19 @@ def make_infos(transition: Transition, n_joint_actions: int) -> dict[str, Any]:
         _add_finals(infos, transition, n_joint_actions)
     elif len(transition.ended):
         _add_metrics(infos, transition)
-    add_masks(infos, transition.masks, np.ones(len(transition.dones), np.bool_), n_joint_actions)
+    infos["action_mask"] = transition.masks
+    infos["_action_mask"] = np.ones(len(transition.dones), np.bool_)
+    if n_joint_actions:
+        add_joint_masks(infos, n_joint_actions)
     return infos
 
 
-def add_masks(
-    infos: dict[str, Any],
-    masks: NDArray[np.int8],
-    rows: NDArray[np.bool_],
-    n_joint_actions: int,
-) -> None:
-    """Add the action masks, shape (B, N, A), of the rows that have any, shape (B,)."""
-    infos["action_mask"], infos["_action_mask"] = masks, rows
-    if n_joint_actions:
-        joint = np.empty((len(masks), n_joint_actions), np.int8)
-        fill_joint_masks(masks, joint)
-        infos["joint_action_mask"], infos["_joint_action_mask"] = joint, rows.copy()
+def add_joint_masks(infos: dict[str, Any], n_joint_actions: int) -> None:
+    """Add the masks of numbered joint actions, shape (B, A**N), beside those of the agents."""
+    masks, rows = infos["action_mask"], infos["_action_mask"]
+    joint = np.empty((len(masks), n_joint_actions), np.int8)
+    fill_joint_masks(masks, joint)
+    infos["joint_action_mask"], infos["_joint_action_mask"] = joint, rows.copy()
 
 
 def _add_metrics(infos: dict[str, Any], transition: Transition) -> None:
@@ -82,8 +79,9 @@ def _add_finals(infos: dict[str, Any], transition: Transition, n_joint_actions: 
         final_obs[index] = observation
     action_mask = np.zeros_like(transition.masks)
     action_mask[ended] = transition.last_masks
-    final_info: dict[str, Any] = {}
-    add_masks(final_info, action_mask, dones.copy(), n_joint_actions)
+    final_info = {"action_mask": action_mask, "_action_mask": dones.copy()}
+    if n_joint_actions:
+        add_joint_masks(final_info, n_joint_actions)
     _add_metrics(final_info, transition)
     infos["final_obs"], infos["_final_obs"] = final_obs, dones.copy()
     infos["final_info"], infos["_final_info"] = final_info, dones.copy()

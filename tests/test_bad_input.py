@@ -20,6 +20,8 @@ import pytest
 
 import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.rows import Rows
+from mapp_env.simulation import Simulation
 from mapp_env.task import Task
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -573,6 +575,45 @@ def test_batched_actions(case: str, same: Any) -> None:
         with pytest.raises(ValueError, match="action"):
             venv.step(BAD_BATCHES[case])
     same(venv.step(np.array(GOOD_BATCH)), twin.step(np.array(GOOD_BATCH)))
+
+
+@pytest.mark.parametrize("allow_wait", [False, True])
+def test_no_action_reaches_the_rules_unseen(allow_wait: bool, same: Any) -> None:
+    """What steps the rules refuses bad actions itself, and nothing has moved: a face may err.
+
+    The rules index a table with actions, so a negative one would be a segmentation fault.
+    """
+    task = Task(PAPER, allow_wait=allow_wait)
+    simulations = [Simulation(task, 3) for _ in range(2)]
+    batches = [Rows(task, 2, 1) for _ in range(2)]
+    nobody = np.zeros(2, bool)
+    for simulation in simulations:
+        simulation.reset(None, np.random.default_rng(0))
+    for rows in batches:
+        rows.start(np.arange(2), np.array([1, 2], np.uint64))
+        rows.step(np.array([[0, 1, 2], [3, 2, 1]]), nobody)
+    n_actions = 4 + allow_wait
+    for bad in (n_actions, 8, 2**32, -1, -(2**63)):
+        for place in range(3):
+            actions = np.zeros((2, 3), np.int64)
+            actions[1, place] = bad
+            with pytest.raises(ValueError, match="actions must be in 0"):
+                simulations[0].step(actions[1])
+            with pytest.raises(ValueError, match="actions must be in 0"):
+                batches[0].step(actions, nobody)
+    for shape in ((2, 2), (2, 4), (1, 3), (3, 3)):
+        with pytest.raises(ValueError, match="actions must be in 0"):
+            batches[0].step(np.zeros(shape, np.int64), nobody)
+    for count in (2, 4):
+        with pytest.raises(ValueError, match="actions must hold"):
+            simulations[0].step(np.zeros(count, np.int64))
+    good = np.array([[0, 1, n_actions - 1], [3, 2, 1]])
+    same(simulations[0].step(good[0]), simulations[1].step(good[0]))
+    same(batches[0].step(good, nobody), batches[1].step(good, nobody))
+    changed = good  # an array that was right once is looked at again
+    changed[0, 0] = 8
+    with pytest.raises(ValueError, match="actions must be in 0"):
+        batches[0].step(changed, nobody)
 
 
 def test_batched_message_names_the_value() -> None:
