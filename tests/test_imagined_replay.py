@@ -245,6 +245,36 @@ def test_any_number_of_landmarks_is_left_elsewhere():
     np.testing.assert_allclose(shares[1:], 0.25, atol=0.08)
 
 
+def test_elsewhere_includes_the_depot():
+    """Where episodes do not start at the depot, each agent stands there as often as anywhere."""
+    grid = GRIDS["hall"]
+    rng = np.random.default_rng(0)
+    replay = make_replay(grid, 2, 1, n_rows=4000, from_depot=0.0)
+    experience(replay, grid, rng, 1.0)
+    replay.start_over(rng)
+    at_depot = replay.cells == grid.depot
+    alone = at_depot.sum(axis=1) == 1  # both there: may be an episode from the depot
+    share = 1 / (grid.reachable.size + 1)
+    assert alone.mean() == pytest.approx(2 * share * (1 - share), rel=0.3)
+
+
+def test_followed_episodes_forget_no_visit():
+    """Landmarks visited before, and those under the agents now, are visited after a step."""
+    grid = GRIDS["hall"]
+    rng = np.random.default_rng(0)
+    replay = make_replay(grid, 2, 4, n_rows=200, from_depot=0.5)
+    experience(replay, grid, rng, 1.0)
+    replay.start_over(rng)
+    left = 0
+    for _ in range(6):
+        before = replay.visited.copy()
+        replay.follow(rng.integers(4, size=(200, 2)))
+        on = (replay.landmarks[:, :, None] == replay.cells[:, None, :]).any(axis=2)
+        np.testing.assert_array_equal(replay.visited, before | on)
+        left += int((before & ~on).sum())
+    assert left > 100
+
+
 def test_only_ended_episodes_begin_anew():
     """Rows that are neither solved nor too old keep their state to the bit."""
     grid = GRIDS["paper"]
