@@ -121,6 +121,22 @@ def test_engine_counts_episodes_as_monitor_does() -> None:
     assert count > 20
 
 
+def test_reset_in_mid_episode_counts_anew() -> None:
+    """Return and length of an episode begin with it, also where a reset cut the last one short."""
+    envs = make_sb3_vec(2, n_landmarks=40, max_cycles=12)
+    envs.reset()
+    for _ in range(5):
+        envs.step(np.zeros((2, 3), int))
+    envs.reset()
+    total = np.zeros(2)
+    for _ in range(12):
+        _, rewards, dones, infos = envs.step(np.zeros((2, 3), int))
+        total += rewards
+    assert dones.all()
+    assert [info["episode"]["l"] for info in infos] == [12, 12]
+    assert [info["episode"]["r"] for info in infos] == total.tolist()
+
+
 @pytest.mark.parametrize(
     "make",
     [

@@ -90,6 +90,14 @@ def test_masks_of_joint_actions_that_do_not_fit() -> None:
     mapp_env.make_vec(2**12, n_agents=6, central_action="joint")
 
 
+def test_most_rows() -> None:
+    """A batch of 1,048,576 rows can be made; one row more is refused by name."""
+    grid = mapp_env.Grid.from_text("D.\n")
+    smallest: dict[str, Any] = {"grid": grid, "n_agents": 1, "n_landmarks": 1}
+    assert mapp_env.make_vec(2**20, **smallest).num_envs == 1_048_576
+    refusal("num_envs", 1_048_577, lambda: mapp_env.make_vec(2**20 + 1, **smallest))
+
+
 @pytest.mark.parametrize("name", ["n_agents", "n_landmarks", "max_cycles"])
 def test_absurd_counts_cost_nothing(name: str) -> None:
     """A count of a billion is refused before anything of that size is made."""
@@ -637,6 +645,8 @@ def test_batched_message_names_the_value() -> None:
         np.array([[0, 6, 20, 42, 48], [0, 6, 20, 42, 2**32 + 1]]),
         np.array([[0, 6, 20, 42], [0, 6, 20, 42]]),
         np.array([[0.0, 6, 20, 42, 48], [0, 6, 20, 42, 47.5]]),
+        np.array([[0.0, 6, 20, 42, 48], [0, 6, 20, 42, 47]]),
+        np.array([["0", "6", "20", "42", "48"]] * 2),
         np.array([[True, False, True, False, True]] * 2),
     ],
 )

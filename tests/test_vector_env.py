@@ -293,6 +293,24 @@ def test_equal_seeds_twin_and_other_seeds_share_no_row() -> None:
         assert not seeds[first] & seeds[second]
 
 
+def test_masked_seed_is_for_the_rows_of_the_mask(same: Any) -> None:
+    """reset(seed=0) of some rows gives them the seeds of a whole reset, and leaves all others'."""
+    mask = np.array([False, True, True, False])
+    venv, twin, fresh = (mapp_env.make_vec(4, **settings()) for _ in range(3))
+    whole, _ = fresh.reset(seed=0)
+    for each in (venv, twin):
+        each.reset(seed=9)
+    before = venv.np_random_seed
+    batch, _ = venv.reset(seed=0, options={"reset_mask": mask.copy()})
+    twin.reset(options={"reset_mask": mask.copy()})
+    same(batch[mask], whole[mask])
+    pairs = zip(mask, fresh.np_random_seed, before, strict=True)
+    assert venv.np_random_seed == tuple(new if chosen else old for chosen, new, old in pairs)
+    rows, others = venv.reset()[0], twin.reset()[0]
+    same(rows[~mask], others[~mask])  # they have drawn on as if nothing had been seeded
+    assert not (rows[mask] == others[mask]).all()
+
+
 def test_unseeded_batches_differ() -> None:
     """Without a seed two batches draw different problems, and a second reset draws new ones."""
     venv = mapp_env.make_vec(32)
@@ -340,6 +358,50 @@ def test_reset_mask_resets_only_its_rows(same: Any) -> None:
         ours, others = venv.step(action), twin.step(action)
         same(ours[0][1:3], others[0][1:3])
         same(ours[1][1:3], others[1][1:3])
+
+
+def test_partial_reset_leaves_the_ends_of_other_rows(same: Any) -> None:
+    """Where rows end together and some are reset by hand, the others' ends are not forgotten."""
+    arguments = settings(max_cycles=3, n_landmarks=5)
+    ours = mapp_env.make_vec(3, **arguments)
+    theirs = make_sync(3, AutoresetMode.NEXT_STEP, **arguments)
+    waiting = mapp_env.make_vec(3, autoreset_mode=AutoresetMode.DISABLED, **arguments)
+    for venv in (ours, theirs, waiting):
+        venv.reset(seed=[4, 5, 6])
+        for _ in range(3):
+            ended = venv.step(np.zeros((3, 2), int))[3]
+        assert ended.all()
+        venv.reset(options={"reset_mask": np.array([True, False, False])})
+    for action in (1, 3, 0, 2, 1, 0):
+        actions = np.full((3, 2), action)
+        same(ours.step(actions), theirs.step(actions))
+    with pytest.raises(gymnasium.error.ResetNeeded, match="row 1 has ended"):
+        waiting.step(np.zeros((3, 2), int))
+    waiting.reset(options={"reset_mask": np.array([False, True, False])})
+    with pytest.raises(gymnasium.error.ResetNeeded, match="row 2 has ended"):
+        waiting.step(np.zeros((3, 2), int))
+
+
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+def test_transitions_are_the_callers(mode: AutoresetMode, same: Any) -> None:
+    """Whoever steps by advance() may write into every array of what it returns."""
+    clean, dirty = (mapp_env.make_vec(4, autoreset_mode=mode, **settings()) for _ in range(2))
+    rng, ends = np.random.default_rng(3), 0
+    for venv in (clean, dirty):
+        venv.reset(seed=7)
+    for _ in range(60):
+        actions = random_actions(rng, clean)
+        found = [tuple(venv.advance(actions)) for venv in (clean, dirty)]
+        same(*found)
+        ended = found[0][2] | found[0][3]
+        ends += int(ended.sum())
+        for array in found[1]:
+            if isinstance(array, np.ndarray) and array.size:
+                array.fill(1)
+        if mode == AutoresetMode.DISABLED and ended.any():
+            for venv in (clean, dirty):
+                venv.reset(options={"reset_mask": ended.copy()})
+    assert ends > 8
 
 
 def test_disabled_mode_refuses_to_step_a_finished_row() -> None:
