@@ -310,3 +310,14 @@ def test_a_plan_may_take_longer_than_an_episode() -> None:
     assert (
         Plan(**{**by_hand.__dict__, "problem": problem}).to_record()["problem"]["max_cycles"] == 2
     )
+
+
+@pytest.mark.parametrize("status", ["feasible", "optimal"])
+def test_what_leaves_a_landmark_is_infeasible(status: str) -> None:
+    """A plan that does not visit all is called nothing else, and one that does not infeasible."""
+    unsolved, solved = replay(LINE, [[1, 1]]), replay(LINE, [[1, 0]] * 3)
+    unsolved.verify()
+    with pytest.raises(ValueError, match=f"status '{status}' contradicts success=False"):
+        dataclasses.replace(unsolved, status=status).verify()
+    with pytest.raises(ValueError, match="status 'infeasible' contradicts success=True"):
+        dataclasses.replace(solved, status="infeasible").verify()

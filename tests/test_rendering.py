@@ -698,3 +698,29 @@ def test_only_the_proven_cost_is_marked() -> None:
         title = draw_plan(problem, plan).get_title()
         assert title.count("(optimal)") == 1
         assert f"{objective.replace('_', ' ')} {plan.cost} (optimal)" in title
+
+
+@pytest.mark.parametrize("face", ["parallel", "central"])
+def test_the_window_shows_every_step(human: Any, face: str) -> None:
+    """After a reset and after each step, the last one too, the window shows that very moment."""
+    import gymnasium
+    import pygame
+
+    from mapp_env import mapp_v0
+
+    if face == "parallel":
+        env: Any = mapp_v0.parallel_env(render_mode="human", max_cycles=2)
+    else:
+        env = gymnasium.make("mapp_env/Central-v0", render_mode="human", max_cycles=2).unwrapped
+
+    def check() -> None:
+        surface = env._display._window._window.get_surface()
+        shown = pygame.surfarray.array3d(surface).transpose(1, 0, 2)
+        assert np.array_equal(shown, rgb_array(env._simulation.scene()))
+
+    env.reset(seed=0)
+    check()
+    for _ in range(2):
+        env.step(dict.fromkeys(env.agents, 1) if face == "parallel" else 21)
+        check()
+    env.close()
