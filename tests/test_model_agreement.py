@@ -703,3 +703,15 @@ def test_a_problems_limit_ends_with_its_episode(face: str) -> None:
                 over = bool(np.all(truncated))
             steps += 1
         assert steps == expected
+
+
+@pytest.mark.parametrize("n_landmarks", [1, 2, 3])
+def test_few_landmarks_are_uniform_too(n_landmarks: int) -> None:
+    """Also of one landmark each allowed cell is as likely, the last one not less than others."""
+    n_rows = 8000
+    observations, _ = mapp_env.make_vec(n_rows, n_landmarks=n_landmarks).reset(seed=5)
+    drawn = observations[:, 3 : 3 + n_landmarks].astype(int)
+    allowed = landmark_cells(PAPER_ROWS)
+    counts = np.bincount(drawn.ravel(), minlength=49)[allowed]
+    expected = n_rows * n_landmarks / len(allowed)
+    assert np.abs(counts - expected).max() < 4.5 * math.sqrt(expected)
