@@ -229,7 +229,8 @@ def evaluate(
         )
     n_problems = len(landmarks)
     n_kept = min(n_kept, n_problems)
-    batch = min(BATCH, n_problems)
+    # Two rows of two cells could as well be (row, col) pairs: never fewer than three rows.
+    batch = min(BATCH, max(n_problems, 3))
     envs = make_vec(
         batch,
         autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,

@@ -53,6 +53,7 @@ MAX_MARKS = 1_000
 """Most brackets, colons and quotes in a file: a parser may need a second for millions of them."""
 
 MAX_INTEGER = 2**53 - 1  # what every reader of JSON keeps exactly
+MAX_PATH_LETTERS = 320  # of a path in a message
 MAX_LINKS = 40  # as Linux follows at most
 STREAMS = ("/proc/", "/dev/fd/")  # where a process finds the files it has open
 UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.tmp")  # until it is whole and takes its name
@@ -250,7 +251,7 @@ def read_bytes(
         # Non-blocking: opening a FIFO that nobody writes to would otherwise wait for ever.
         handle = os.open(source, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except (OSError, ValueError) as error:
-        raise error_type(f"{describe(source)}: cannot be opened as {what}: {error}") from error
+        raise error_type(f"{_named(source)}: cannot be opened as {what}: {error}") from error
     try:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
@@ -267,6 +268,11 @@ def read_bytes(
     if len(data) > limit:
         raise error_type(f"{source}: has more than {limit} bytes, which {what} may have")
     return data
+
+
+def _named(path: str | os.PathLike[str]) -> str:
+    """Return a path for a message, whole unless it is absurdly long."""
+    return describe(os.fspath(path), MAX_PATH_LETTERS)
 
 
 def _shown(value: object) -> str:
@@ -351,7 +357,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes, limit: int) -> None:
     try:
         _replace(target, data)
     except (OSError, ValueError) as error:
-        raise FileError(f"{describe(path)}: cannot be written: {error}") from error
+        raise FileError(f"{_named(path)}: cannot be written: {error}") from error
 
 
 def check_writable(path: str | os.PathLike[str]) -> str:
@@ -372,13 +378,13 @@ def check_writable(path: str | os.PathLike[str]) -> str:
         os.stat(os.path.dirname(target))
         status = os.stat(target) if os.path.lexists(target) else None
     except (OSError, ValueError) as error:
-        raise FileError(f"{describe(path)}: cannot be written: {error}") from error
+        raise FileError(f"{_named(path)}: cannot be written: {error}") from error
     if target.startswith(STREAMS) or (status is not None and not stat.S_ISREG(status.st_mode)):
-        raise FileError(f"{describe(path)}: is there and not a regular file")
+        raise FileError(f"{_named(path)}: is there and not a regular file")
     # To replace a file takes no right to write it; and to root no file is read-only.
     if status is not None and not (status.st_mode & stat.S_IWUSR and os.access(target, os.W_OK)):
         mode = f"{stat.S_IMODE(status.st_mode):04o}"
-        raise FileError(f"{describe(path)}: is there and may not be written: its mode is {mode}")
+        raise FileError(f"{_named(path)}: is there and may not be written: its mode is {mode}")
     return target
 
 

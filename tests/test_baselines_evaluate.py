@@ -436,3 +436,15 @@ def test_no_share_says_all_where_one_is_missing(name):
     """A share is shown as 100 only if it is."""
     assert evaluation_module._format_cell(name, 99.9999) == "99.99"
     assert evaluation_module._format_cell(name, 100.0) == "100.00"
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_two_problems_of_two_landmarks(count):
+    """So few problems of so few landmarks are evaluated as any, though they might be pairs."""
+    setting = Setting(make_grid("paper-7x7"), 3, 2)
+    landmarks = unseen_problems(setting, 3)
+    policy = NearestLandmarkPolicy(setting.grid, 3, 2)
+    some = evaluate(policy, setting, landmarks[:count], n_kept=count)
+    every = evaluate(policy, setting, landmarks)
+    assert some.cover_time.tolist() == every.cover_time[:count].tolist()
+    assert some.actions.shape[1] == count

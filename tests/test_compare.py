@@ -359,7 +359,7 @@ def test_hidden_files_of_others_are_left_alone(tmp_path):
     """Only what a training itself had begun to write is cleared away."""
     other = tmp_path / "paper-meta-seed0"
     other.mkdir()
-    (other / ".config.json.abc").write_text("{")
+    (other / f".{'a' * 16}.tmp").write_text("{")
     (other / ".notes").write_text("years of work")
     with pytest.raises(ValueError, match=r"holds something else: \.notes"):
         compare.main(tiny(tmp_path), WORDS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import importlib.util
+import importlib
 import os
 import pickle
 import shutil
@@ -214,17 +214,17 @@ def test_copies_of_a_grid_keep_its_depot(copier: Callable[[Any], Any]) -> None:
         assert env.reset(seed=0)[0]["agent_0"][:3].tolist() == [depot] * 3
 
 
-def test_every_file_with_a_kernel_names_the_compiled_code(tmp_path: Path) -> None:
+def test_every_file_with_a_kernel_names_the_compiled_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whichever file with compiled code is edited, the name that the cache goes by is another."""
-    package = tmp_path / "mapp_env"
+    package = tmp_path / "edited_env"
     shutil.copytree(
         Path(mapp_env.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
     )
-    spec = importlib.util.spec_from_file_location("edited", package / "compiled.py")
-    assert spec is not None
-    assert spec.loader is not None
-    edited = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(edited)
+    (package / "__init__.py").write_text("")  # compiled.py alone is imported
+    monkeypatch.syspath_prepend(tmp_path)
+    edited = importlib.import_module("edited_env.compiled")
     names = {edited._digest_sources()}
     files = [path for path in package.rglob("*.py") if "\n@kernel" in path.read_text("utf-8")]
     assert len(files) > 8
