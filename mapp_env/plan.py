@@ -212,10 +212,14 @@ class Plan:
             )
         seconds = as_real(self.seconds)
         if seconds is None or not 0 <= seconds <= MAX_INTEGER:
-            raise ValueError(f"plan: seconds must be a number from 0, got {describe(self.seconds)}")
+            raise ValueError(
+                f"plan: seconds must be a number in 0..{MAX_INTEGER}, got {describe(self.seconds)}"
+            )
         bound = None if self.bound is None else as_integer(self.bound)
-        if self.bound is not None and (bound is None or bound < 0):
-            raise ValueError(f"plan: bound must be an integer from 0, got {describe(self.bound)}")
+        if self.bound is not None and (bound is None or not 0 <= bound <= MAX_INTEGER):
+            raise ValueError(
+                f"plan: bound must be an integer in 0..{MAX_INTEGER}, got {describe(self.bound)}"
+            )
 
     def _verify_status(self) -> None:
         if (self.status == "infeasible") == self.success:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -357,6 +358,40 @@ def test_odd_files_are_refused(kind: str, tmp_path: Path) -> None:
             load(kind, tmp_path / name)
     with pytest.raises(FileError, match="path must be"):
         load(kind, 3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("kind", "limit"), [("problem", 1 << 20), ("plan", 16 << 20)])
+def test_files_have_a_size(kind: str, limit: int, tmp_path: Path) -> None:
+    """A file of exactly a mebibyte, or sixteen for a plan, is read; one of a byte more is not."""
+    fields = fields_of(kind, tmp_path)
+    path = tmp_path / "large.json"
+    path.write_text(json.dumps(fields).ljust(limit))
+    load(kind, path)
+    path.write_text(json.dumps(fields).ljust(limit + 1))
+    with pytest.raises(FileError, match=rf"has {limit + 1} bytes, a {kind} file may have {limit}"):
+        load(kind, path)
+
+
+@pytest.mark.parametrize("kind", ["problem", "plan"])
+def test_a_byte_order_mark_is_named(kind: str, tmp_path: Path) -> None:
+    """A good file is refused below a byte order mark, which JSON has not; the message says so."""
+    fields = fields_of(kind, tmp_path)
+    (tmp_path / "bad.json").write_text(json.dumps(fields), encoding="utf-8-sig")
+    with pytest.raises(FileError, match=r"bad\.json: is not strict JSON: Unexpected UTF-8 BOM"):
+        load(kind, tmp_path / "bad.json")
+
+
+def test_numbers_are_those_that_every_reader_keeps(tmp_path: Path) -> None:
+    """The largest number is 2**53 - 1, where no rule of the plan forbids it."""
+    path = tmp_path / "plan.json"
+    plan = dataclasses.replace(replay(PROBLEM, [[0, 0]]), bound=2**53 - 1, seconds=2**53 - 1)
+    plan.save(path)
+    assert Plan.load(path).bound == 2**53 - 1
+    fields = json.loads(path.read_text())
+    for name in ("bound", "seconds"):
+        path.write_text(json.dumps({**fields, name: 2**53}))
+        with pytest.raises(FileError, match=rf"'{name}' must be .* in 0\.\.9007199254740991"):
+            Plan.load(path)
 
 
 def test_a_file_says_what_it_is(tmp_path: Path) -> None:

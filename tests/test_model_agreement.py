@@ -427,7 +427,10 @@ def test_paper_grid_is_r1() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_grid_tables_are_the_model(seed: int) -> None:
-    """Grid: text, moves, distances, home, reachable cells and paths are those of plain BFS."""
+    """Grid: text, moves, distances, home, reachable cells and paths are those of plain BFS.
+
+    From a wall nothing leads anywhere; of equal paths the first in the order of actions is taken.
+    """
     rng = random.Random(seed)
     rows = random_rows(rng, rng.randint(1, 9), rng.randint(2, 9), 1)
     grid = mapp_env.Grid.from_text("\n".join(rows) + "\n")
@@ -438,6 +441,9 @@ def test_grid_tables_are_the_model(seed: int) -> None:
     home = shortest(rows, grid.depot)
     for cell in range(grid.n_cells):
         if rows[cell // n_cols][cell % n_cols] == "#":
+            assert (grid.moves[cell] == cell).all()
+            assert (grid.distances[cell] == -1).all()
+            assert (grid.distances_from([cell]) == -1).all()
             continue
         assert [int(n) for n in grid.moves[cell][:4]] == [moved(rows, cell, a) for a in range(4)]
         assert grid.home[cell] == home.get(cell, -1)
@@ -450,7 +456,9 @@ def test_grid_tables_are_the_model(seed: int) -> None:
         assert len(path) == home[goal] + 1
         assert (path[0], path[-1]) == (grid.depot, goal)
         for here, there in itertools.pairwise(path):
-            assert there in [moved(rows, here, action) for action in range(4)]
+            ways = [moved(rows, here, action) for action in range(4)]
+            ahead = grid.distances[goal, here] - 1
+            assert there == next(way for way in ways if grid.distances[goal, way] == ahead)
 
 
 def test_claim_goes_to_the_lowest_index() -> None:

@@ -152,6 +152,25 @@ def test_an_idle_agent_bumps_where_it_can() -> None:
     assert walk_tours(problem, [(4, 3, 2, 1, 2, 3, 4), ()]).tolist() == [[0, 1]] * 3
 
 
+PLUS = Problem(Grid.from_text("#.#\n.D.\n#.#"), (1, 3, 5, 7), 3)  # landmarks on all sides
+
+
+def test_an_idle_agent_waits_until_a_way_is_free() -> None:
+    """With landmarks all around, an agent before the one that walks leaves it the first claim."""
+    tour = (4, 1, 4, 3, 4, 5, 4, 7, 4)
+    actions = walk_tours(PLUS, [(), tour, ()])
+    assert actions[:, 0].tolist() == [4, 2, 3, 2, 3, 2, 3]
+    assert actions[:, 2].tolist() == [2, 3, 2, 3, 2, 3, 2]
+    assert replay(PLUS, actions).claims == ((), (1, 3, 5, 7), ())
+
+
+def test_an_idle_agent_follows_the_lowest_of_a_tie() -> None:
+    """Where two arrive at once, the one of lower index claims, so one between may come along."""
+    actions = walk_tours(PLUS, [(4, 1, 4, 3, 4, 5, 4), (), (4, 1, 4, 7, 4)])
+    assert actions[:, 1].tolist() == [2, 3, 2, 3, 2]
+    assert replay(PLUS, actions).claims == ((1, 3, 5), (), (7,))
+
+
 def test_long_plans_are_checked() -> None:
     """A tour of a hundred thousand cells verifies, or is found to jump: each step is seen once."""
     plan = Plan(((1, 2) * 50_000 + (1, 2, 3, 4, 3, 2, 1), ()), ((2, 4), ()), 100_003, 100_006, 1)
@@ -187,6 +206,10 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
         "agent 1 has 0 claims",
     ),
     "does not visit": ({"tours": (TOURS[1], TOURS[1])}, "does not visit its claims"),
+    "claims in another order": (
+        {"tours": ((4, 3, 0, 1, 2, 1, 4), ()), "claims": ((2, 0), ())},
+        "does not visit its claims in their order",
+    ),
     "detour home": ({"tours": ((4, 3, 0, 3, 4, 3, 4), TOURS[1])}, "shortest path home"),
     "other way out": ({"tours": ((4, 1, 0, 1, 4), TOURS[1])}, "tours is stated"),
     "swapped claims": ({"claims": PLAN.claims[::-1], "tours": PLAN.tours[::-1]}, "claims is"),
@@ -206,11 +229,24 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "a pair for a cell": ({"tours": ((4, (1, 0), 0, 1, 4), TOURS[1])}, "must be a cell in 0..8"),
     "a huge number": ({"tours": ((4, 10**30, 4), TOURS[1])}, "must be a cell in 0..8"),
     "claim steps alone": ({"actions": (), "claim_steps": ((9,), (9,))}, "claim_steps and actions"),
-    "no number for a bound": ({"bound": math.nan}, "bound must be an integer from 0, got nan"),
-    "bound below 0": ({"bound": -1}, "bound must be an integer from 0, got -1"),
-    "no number of seconds": ({"seconds": math.nan}, "seconds must be a number from 0, got nan"),
-    "an absurd number of seconds": ({"seconds": 1e300}, "seconds must be a number from 0, got 1e"),
-    "negative seconds": ({"seconds": -1e-9}, "seconds must be a number from 0, got -1e-09"),
+    "no number for a bound": (
+        {"bound": math.nan},
+        "bound must be an integer in 0..9007199254740991, got nan",
+    ),
+    "a bound above all": ({"bound": 2**53}, "bound must be an integer in 0..9007199254740991"),
+    "bound below 0": ({"bound": -1}, "bound must be an integer in 0..9007199254740991, got -1"),
+    "no number of seconds": (
+        {"seconds": math.nan},
+        "seconds must be a number in 0..9007199254740991, got nan",
+    ),
+    "an absurd number of seconds": (
+        {"seconds": 1e300},
+        "seconds must be a number in 0..9007199254740991, got 1e",
+    ),
+    "negative seconds": (
+        {"seconds": -1e-9},
+        "seconds must be a number in 0..9007199254740991, got -1e-09",
+    ),
     "a long name": ({"solver": "x" * 101}, "solver must be a str of at most 100 letters"),
     "below the bound": ({"status": "optimal", "bound": 1}, "'optimal' needs bound"),
 }
