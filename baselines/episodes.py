@@ -9,6 +9,7 @@ import torch
 from baselines.networks import Network, split_joint
 from baselines.settings import Setting
 from mapp_env import make_vec
+from mapp_env.grid import pairs_of
 
 
 class Episodes(NamedTuple):
@@ -29,6 +30,16 @@ def make_envs(setting: Setting, n_rows: int, max_length: int) -> gymnasium.vecto
         n_landmarks=setting.n_landmarks,
         max_cycles=max_length,
     )
+
+
+def begin(
+    envs: gymnasium.vector.VectorEnv, landmarks: np.ndarray, seed: int | None = None
+) -> np.ndarray:
+    """Start an episode on each row of landmarks (P, K); return what is seen, (P, N + 2K)."""
+    # As pairs: two rows of two cells could as well be two pairs.
+    pairs = pairs_of(envs.unwrapped.task.grid, landmarks)  # type: ignore[attr-defined]
+    observations: np.ndarray = envs.reset(seed=seed, options={"landmarks": pairs})[0]
+    return observations
 
 
 def play(
@@ -59,7 +70,7 @@ def play(
     rng
         Source of all draws.
     """
-    seen, _ = envs.reset(options={"landmarks": landmarks})
+    seen = begin(envs, landmarks)
     spec, n_rows = network.spec, len(landmarks)
     playing = np.arange(n_rows)
     lengths = np.full(n_rows, max_length + 1)

@@ -16,6 +16,7 @@ import numpy as np
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.checks import check_count, check_grid
+from baselines.episodes import begin
 from baselines.guidance import Acting
 from baselines.policy import MAX_TABLE_CELLS, EarliestArrivalPolicy, NearestLandmarkPolicy
 from baselines.settings import Setting
@@ -229,8 +230,7 @@ def evaluate(
         )
     n_problems = len(landmarks)
     n_kept = min(n_kept, n_problems)
-    # Two rows of two cells could as well be (row, col) pairs: never fewer than three rows.
-    batch = min(BATCH, max(n_problems, 3))
+    batch = min(BATCH, n_problems)
     envs = make_vec(
         batch,
         autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
@@ -254,7 +254,7 @@ def evaluate(
         # The last batch is filled up with problems played before; they are not read again.
         rows = np.minimum(np.arange(start, start + batch), n_problems - 1)
         playing = np.arange(batch) < n_problems - start
-        observations, _ = envs.reset(seed=0, options={"landmarks": landmarks[rows]})
+        observations = begin(envs, landmarks[rows], seed=0)
         actions = np.zeros((batch, setting.n_agents), np.int64)
         step = 0
         while playing.any():

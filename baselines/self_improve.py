@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from baselines.checks import check_count, check_number
-from baselines.episodes import Episodes, draw_problems, make_envs, play
+from baselines.episodes import Episodes, begin, draw_problems, make_envs, play
 from baselines.imitation import (
     ImitationOptions,
     Pupil,
@@ -218,7 +218,7 @@ class SelfImproved(Pupil):
         index = np.resize(np.repeat(np.arange(len(seen)), n_tried), self.envs.num_envs)
         action = np.resize(tried.ravel(), self.envs.num_envs)
         time, problem = times[index], problems[index]
-        here, _ = self.envs.reset(options={"landmarks": landmarks[problem]})
+        here = begin(self.envs, landmarks[problem])
         playing = np.arange(self.envs.num_envs) < count
         for step in range(int(lengths[problems].max())):
             commands = np.where(step < time, joint[step, problem], action)

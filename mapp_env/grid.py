@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -372,6 +372,11 @@ def trace_path(moves: NDArray[np.int32], steps: NDArray[np.int32], path: NDArray
             if steps[to] == steps[cell] - 1:
                 path[place] = to
                 break
+
+
+def pairs_of(grid: Grid, cells: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
+    """Return cells, shape (...), as (row, col) pairs, shape (..., 2)."""
+    return np.stack(np.divmod(cells, grid.cols), axis=-1)
 
 
 def tell_apart(grid: Grid, other: Grid) -> str:

@@ -50,18 +50,19 @@ def check_problems(
     landmarks = None if options is None else options.get("landmarks")
     if isinstance(landmarks, np.ndarray) and landmarks.ndim > 1:
         rows, pairs = (num_envs, task.n_landmarks), (task.n_landmarks, 2)
-        if landmarks.shape not in (rows, pairs):
+        if landmarks.shape not in (rows, (*rows, 2), pairs):
             raise ValueError(
-                f"options['landmarks'] must be of shape {rows}, cells for each row, or {pairs}, "
-                f"(row, col) pairs for all; got shape {landmarks.shape}"
+                f"options['landmarks'] must be of shape {rows}, cells for each row, {(*rows, 2)}, "
+                f"(row, col) pairs for each row, or {pairs}, pairs for all; got shape "
+                f"{landmarks.shape}"
             )
-        if rows == pairs:
+        if landmarks.shape == rows == pairs:
             raise ValueError(
-                "options['landmarks'] of shape (2, 2) may mean a cell for each of 2 rows "
-                "or (row, col) pairs: pass pairs as a list, or reset row by row"
+                "options['landmarks'] of shape (2, 2) may mean cells for each of 2 rows or (row, "
+                "col) pairs for all: pass pairs for each row, shape (2, 2, 2), or a list of pairs"
             )
-        if landmarks.shape == rows:
-            return _check_cells(landmarks, task), None
+        if landmarks.shape != pairs:
+            return _check_rows(landmarks, task), None
     problem = task.check_options(options)
     if problem is None:
         return None, None
@@ -69,17 +70,23 @@ def check_problems(
     return np.repeat(cells[None], num_envs, axis=0), problem.max_cycles
 
 
-def _check_cells(landmarks: NDArray[Any], task: Task) -> NDArray[np.int32]:
-    """Return landmarks of each row, shape (B, K), if they satisfy rule R2."""
-    grid = task.grid
+def _check_rows(landmarks: NDArray[Any], task: Task) -> NDArray[np.int32]:
+    """Return the landmarks of each row as cells, shape (B, K), if they satisfy rule R2.
+
+    They are given as cells, shape (B, K), or as (row, col) pairs, shape (B, K, 2).
+    """
+    grid, cells = task.grid, landmarks
     ok = landmarks.dtype.kind in "iu"
+    if ok and landmarks.ndim == 3:
+        inside = ((landmarks >= 0) & (landmarks < grid.walls.shape)).all(axis=2)
+        cells = np.where(inside, landmarks[..., 0] * grid.cols + landmarks[..., 1], grid.depot)
     if ok:
-        ordered = np.sort(landmarks, axis=1)
-        allowed = np.isin(landmarks, grid.reachable).all(axis=1)
+        ordered = np.sort(cells, axis=1)
+        allowed = np.isin(cells, grid.reachable).all(axis=1)
         distinct = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
         ok = bool((allowed & distinct).all())
     if not ok:
         # Row by row, for the message that says which cell of which row is wrong and why.
-        for index, cells in enumerate(landmarks):
-            check_landmarks(grid, cells, name=f"options['landmarks'][{index}]")
-    return landmarks.astype(np.int32)
+        for index, wanted in enumerate(landmarks):
+            check_landmarks(grid, wanted, name=f"options['landmarks'][{index}]")
+    return cells.astype(np.int32)

@@ -175,7 +175,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         options : dict, optional
             ``"reset_mask"``: bool, shape (B,). ``"landmarks"`` or ``"problem"``: as in the single
             environment, for all rows alike; or the landmarks of each row as an int array of cells,
-            shape (B, K). Other keys are ignored.
+            shape (B, K), or of (row, col) pairs, shape (B, K, 2). Other keys are ignored.
 
         Returns
         -------

@@ -595,3 +595,10 @@ def test_a_callback_can_be_used_again() -> None:
         model.learn(10**9, callback=watch)
         assert watch.elapsed >= 0.2
         assert model.num_timesteps > 2  # two rows: more than one step
+
+
+def test_two_rows_of_two_landmarks() -> None:
+    """A list of options means a problem for each row, also where an array could mean pairs."""
+    envs = make_sb3_vec(2, n_landmarks=2)
+    envs.set_options([{"landmarks": [0, 6]}, {"landmarks": [42, 20]}])
+    assert envs.reset()[:, 3:5].tolist() == [[0, 6], [42, 20]]

@@ -122,12 +122,21 @@ def test_aec_refuses_a_bad_action_when_it_is_given(make: Callable[[], Any], acti
 
 
 def test_landmark_pairs_are_not_taken_for_rows() -> None:
-    """An array that may mean pairs or a cell for each row is refused, a list of pairs is not."""
+    """An array that may mean pairs or a cell for each row is refused; others say which they are."""
     envs = mapp_env.make_vec(2, n_landmarks=2)
     with pytest.raises(ValueError, match="landmarks"):
         envs.reset(options={"landmarks": np.array([[0, 6], [6, 0]])})
     observations, _ = envs.reset(options={"landmarks": [(0, 6), (6, 0)]})
     assert observations[:, 3:5].tolist() == [[6, 42], [6, 42]]
+    pairs = np.array([[(0, 6), (6, 0)], [(0, 0), (2, 6)]])
+    observations, _ = envs.reset(options={"landmarks": pairs})
+    assert observations[:, 3:5].tolist() == [[6, 42], [0, 20]]
+    for bad in ((-1, 1), (0, 7), (1, 1), (3, 3), (0, 0), (2**62, 2**62)):
+        pairs[1, 1] = bad  # off the grid, a wall, the depot, twice
+        with pytest.raises(ValueError, match=r"options\['landmarks'\]\[1\]"):
+            envs.reset(options={"landmarks": pairs})
+    with pytest.raises(ValueError, match="landmarks"):
+        envs.reset(options={"landmarks": pairs.astype(float)})
 
 
 def test_first_reset_needs_every_row() -> None:

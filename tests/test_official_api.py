@@ -376,3 +376,16 @@ def test_make_vec_takes_the_form_of_actions() -> None:
             "mapp_env/Central-v0", num_envs=2, vectorization_mode="vector_entry_point", **options
         )
         assert type(envs.unwrapped.single_action_space).__name__ == kind
+
+
+def test_agents_read_before_stay_as_they_were() -> None:
+    """A list of agents that somebody keeps is not emptied, nor does changing it lose an agent."""
+    env = mapp_v0.parallel_env(max_cycles=1, n_landmarks=40)
+    env.reset(seed=0)
+    before = env.agents
+    env.step(dict.fromkeys(env.agents, 0))
+    assert before == env.possible_agents
+    assert env.agents == []
+    env.reset()
+    env.agents.clear()
+    assert len(env.possible_agents) == 3

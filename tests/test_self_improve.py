@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from baselines import imitation, self_improve
+from baselines.episodes import draw_problems, make_envs, play
 from baselines.evaluation import evaluate, find_optima, unseen_problems
 from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
 from baselines.policy import NetworkPolicy, load_policy, save_policy
@@ -327,3 +328,14 @@ def test_the_table_is_over_problems_never_trained_on(folder, tmp_path, monkeypat
     assert self_improve.main(Args(policy=str(folder), out=tmp_path / "run", **options)) == 0
     assert len(played[0]) == 10
     assert not played[0] & seen
+
+
+def test_two_problems_of_two_landmarks_are_played():
+    """Episodes are those of the problems given, also where these could mean pairs."""
+    landmarks = draw_problems(GRID.reachable, SETTING.n_landmarks, 3, np.random.default_rng(0))
+    network, lengths = untrained(), []
+    for count in (2, 3):
+        envs = make_envs(SETTING, count, 30)
+        greedy, rng = np.ones(count, bool), np.random.default_rng(0)
+        lengths.append(play(envs, network, landmarks[:count], 30, 1.0, greedy, rng).lengths)
+    assert lengths[0].tolist() == lengths[1][:2].tolist()

@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
 from mapp_env.central_env import central_action_masks
+from mapp_env.grid import pairs_of
 from mapp_env.row_seeds import spread_seed
 from mapp_env.validation import MAX_SEED, check_count, describe
 from mapp_env.vector_env import MappVectorEnv
@@ -132,7 +133,9 @@ class MappSb3VecEnv(RowsVecEnv):
                 raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
             self._wishes = deepcopy(dict(options or {}))
             return
-        self._wishes = {"landmarks": np.array(self._landmarks_by_row(options))}
+        cells = np.array(self._landmarks_by_row(options))
+        # As pairs: two rows of two cells could as well be two pairs.
+        self._wishes = {"landmarks": pairs_of(self.engine.task.grid, cells)}
 
     def _landmarks_by_row(self, options: Any) -> list[tuple[int, ...]]:
         """Return the landmarks of a list of options, one a row."""
