@@ -24,9 +24,9 @@ from pathlib import Path
 import tyro
 
 from baselines import meta_dqn
-from baselines.checks import check_choice, check_count
-from baselines.studies import run_study
-from baselines.trials import Trial, plan_trial
+from baselines.learning.study import run_study
+from baselines.learning.trials import Trial, plan_trial
+from mapp_env.validation import check_choice, check_count
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),

@@ -27,10 +27,10 @@ from typing import Literal
 import tyro
 
 from baselines import independent_dqn, meta_dqn
-from baselines.checks import check_count
-from baselines.options import Options
-from baselines.studies import Summary, interval, run_study
-from baselines.trials import Trial, plan_trial
+from baselines.learning.config import Options
+from baselines.learning.study import Summary, interval, run_study
+from baselines.learning.trials import Trial, plan_trial
+from mapp_env.validation import check_count
 
 LEARNERS: dict[str, tuple[str, type[Options], tuple[str, ...]]] = {
     "meta": (meta_dqn.ALGORITHM, meta_dqn.Args, ()),
@@ -117,7 +117,7 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
 def draw(out: Path, summaries: Sequence[Summary]) -> None:
     """Draw the figure."""
     # Only here, because drawing takes longer to import than everything before.
-    from baselines.figures import draw_comparison
+    from baselines.policies.figures import draw_comparison
 
     print(draw_comparison(out, summaries, interval))
 

@@ -23,11 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.checkpoints import part
-from baselines.checks import check_count, check_grid, check_number
-from baselines.exact_values import steps_left
-from baselines.imagined_replay import ImaginedReplay
-from baselines.imitation import (
+from baselines.learning.exact_values import steps_left
+from baselines.learning.imitation import (
     ImitationOptions,
     Pupil,
     good_actions_loss,
@@ -37,9 +34,14 @@ from baselines.imitation import (
     start_of,
 )
 from baselines.networks import Network, NetworkSpec, build_network, split_joint, torch_generator
-from baselines.policy import load_policy
-from baselines.settings import N_ACTIONS, Setting, find_grid, read_setting
+from baselines.policies.acting import check_grid
+from baselines.policies.policy import load_policy
+from baselines.policies.settings import N_ACTIONS, Setting, read_setting
+from baselines.replay.imagined import ImaginedReplay
+from baselines.runs.checkpoints import part
 from mapp_env import Grid
+from mapp_env.grids import find_grid
+from mapp_env.validation import check_count, check_number
 
 ALGORITHM = "distill"
 MAX_MISTAKES = 4096  # states that are waiting to be asked again; the oldest is forgotten

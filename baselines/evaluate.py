@@ -25,8 +25,8 @@ import numpy as np
 import torch
 import tyro
 
-from baselines.checks import check_count, check_number
-from baselines.evaluation import (
+from baselines.policies.acting import Acting
+from baselines.policies.evaluation import (
     EVALUATION_SEED,
     MAX_EXACT_LANDMARKS,
     RULES,
@@ -42,10 +42,12 @@ from baselines.evaluation import (
     save_table,
     unseen_problems,
 )
-from baselines.guidance import Acting, Guidance, GuidedPolicy
-from baselines.policy import RandomPolicy
-from baselines.settings import N_ACTIONS, Setting, find_grid
-from baselines.trained import load_trained
+from baselines.policies.guidance import Guidance, GuidedPolicy
+from baselines.policies.policy import RandomPolicy
+from baselines.policies.settings import N_ACTIONS, Setting
+from baselines.policies.trained import load_trained
+from mapp_env.grids import find_grid
+from mapp_env.validation import check_count, check_number
 
 RIVALS = ("random", *RULES)
 SETTING = ("grid", "n_agents", "n_landmarks", "max_cycles")

@@ -25,11 +25,11 @@ import numpy as np
 import torch
 import tyro
 
-from baselines.evaluation import evaluate, every_problem
 from baselines.networks import NetworkSpec
-from baselines.policy import find_weights, load_policy
-from baselines.settings import Setting
-from baselines.trained import load_trained
+from baselines.policies.evaluation import evaluate, every_problem
+from baselines.policies.policy import find_weights, load_policy
+from baselines.policies.settings import Setting
+from baselines.policies.trained import load_trained
 from mapp_env import Grid, make_grid
 from mapp_env.files import write_bytes
 
@@ -138,7 +138,7 @@ def kept_rows(spec: NetworkSpec, grid: Grid) -> dict[str, np.ndarray]:
 
     Landmarks are free cells but the depot; agents stand on these or on the depot, and never on an
     unvisited landmark. The page lists the rows in the same way (``keptRows`` in network.js), and
-    :mod:`baselines.lookups` numbers them.
+    :mod:`baselines.networks.lookups` numbers them.
     """
     c = spec.n_cells
     landmarks = grid.reachable.tolist()

@@ -32,21 +32,22 @@ from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
-from baselines.checks import check_count, check_grid, check_number
-from baselines.evaluation import (
+from baselines.meta_dqn import joint_values
+from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
+from baselines.policies.acting import check_grid
+from baselines.policies.evaluation import (
     MAX_EXACT_LANDMARKS,
     count_unseen,
     evaluate,
     find_optima,
     unseen_problems,
 )
-from baselines.imagined_replay import UNKNOWN, is_on, join
-from baselines.meta_dqn import joint_values
-from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
-from baselines.policy import NetworkPolicy
-from baselines.settings import N_ACTIONS, Setting
-from baselines.trained import load_trained
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.settings import N_ACTIONS, Setting
+from baselines.policies.trained import load_trained
+from baselines.replay.imagined import UNKNOWN, is_on, join
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
+from mapp_env.validation import check_count, check_number
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
 # at sharpnesses from one end to the other, episode by episode.

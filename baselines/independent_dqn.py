@@ -46,9 +46,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.checkpoints import part
-from baselines.checks import check_flag, check_number
-from baselines.experiment import run_experiment
+from baselines.learning.config import Options, parse_options
+from baselines.learning.experiment import run_experiment
+from baselines.learning.q_learning import Goal, QLearner, next_values, td_targets
+from baselines.learning.training import Streams
 from baselines.networks import (
     Network,
     NetworkSpec,
@@ -58,15 +59,14 @@ from baselines.networks import (
     torch_generator,
     view,
 )
-from baselines.options import Options, parse_options
-from baselines.own_imagined_replay import OwnImaginedReplay
-from baselines.policy import NetworkPolicy
-from baselines.q_learner import Goal, QLearner, next_values, td_targets
-from baselines.relabelled_replay import RelabelledReplay
-from baselines.replay_memory import Batch, ReplayMemory
-from baselines.settings import N_ACTIONS
-from baselines.training import Streams
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.settings import N_ACTIONS
+from baselines.replay.own_imagined import OwnImaginedReplay
+from baselines.replay.relabelled import RelabelledReplay
+from baselines.replay.stored import Batch, ReplayMemory
+from baselines.runs.checkpoints import part
 from mapp_env import Grid
+from mapp_env.validation import check_flag, check_number
 
 ALGORITHM = "independent_dqn"
 
@@ -85,13 +85,13 @@ class Args(Options):
     network: Literal["pairs", "paper", "geodesic"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
     landmarks as a set, agents in a fixed order; "geodesic": the agent's own shortest paths, the
-    observation of that name, landmarks as a set (baselines/networks.py)"""
+    observation of that name, landmarks as a set (baselines/networks/__init__.py)"""
     outputs: Literal["agents"] = "agents"
     """a value for each action of the agent itself"""
     replay: Literal["relabelled", "imagined", "stored"] = "relabelled"
     """"stored": transitions as they were played; "relabelled": the agent's own transitions, most of
-    them with fresh landmarks (baselines/relabelled_replay.py); "imagined": the agent's own moves
-    put together anew, the others as they were seen to go (baselines/own_imagined_replay.py)"""
+    them with fresh landmarks (baselines/replay/relabelled.py); "imagined": the agent's own moves
+    put together anew, the others as they were seen to go (baselines/replay/own_imagined.py)"""
 
     share_parameters: bool = False
     """whether all agents use one network, which learns from all of them"""

@@ -30,10 +30,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.checkpoints import take
-from baselines.checks import check_count
-from baselines.experiment import run_experiment
-from baselines.imagined_replay import ImaginedReplay
+from baselines.learning.config import Options, parse_options
+from baselines.learning.experiment import run_experiment
+from baselines.learning.q_learning import QLearner, next_values, td_targets
+from baselines.learning.training import Streams
 from baselines.networks import (
     Network,
     NetworkSpec,
@@ -41,13 +41,13 @@ from baselines.networks import (
     greedy_actions,
     torch_generator,
 )
-from baselines.options import Options, parse_options
-from baselines.policy import NetworkPolicy
-from baselines.q_learner import QLearner, next_values, td_targets
-from baselines.replay_memory import Batch, ReplayMemory
-from baselines.settings import N_ACTIONS
-from baselines.training import Streams
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.settings import N_ACTIONS
+from baselines.replay.imagined import ImaginedReplay
+from baselines.replay.stored import Batch, ReplayMemory
+from baselines.runs.checkpoints import take
 from mapp_env import Grid
+from mapp_env.validation import check_count
 
 ALGORITHM = "meta_dqn"
 MAX_IMAGINED_AGENTS = 6  # 4,096 joint actions, with values for each in imagined replay

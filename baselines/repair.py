@@ -24,11 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from baselines.checkpoints import part
-from baselines.checks import check_count, check_number
-from baselines.episodes import draw_problems, make_envs, play
-from baselines.evaluation import count_problems, evaluate, every_problem
-from baselines.imitation import (
+from baselines.learning.imitation import (
     ImitationOptions,
     Pupil,
     own_options,
@@ -38,8 +34,12 @@ from baselines.imitation import (
     starting_point,
 )
 from baselines.networks import Network
-from baselines.policy import NetworkPolicy
-from baselines.settings import Setting
+from baselines.policies.episodes import draw_problems, make_envs, play
+from baselines.policies.evaluation import count_problems, evaluate, every_problem
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.settings import Setting
+from baselines.runs.checkpoints import part
+from mapp_env.validation import check_count, check_number
 
 ALGORITHM = "repair"
 

@@ -22,10 +22,10 @@ import numpy as np
 import tyro
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.checks import check_choice, check_count, check_number
-from baselines.evaluate import find_grid
-from baselines.evaluation import EVALUATION_SEED, Setting, find_optima, unseen_problems
+from baselines.policies.evaluation import EVALUATION_SEED, Setting, find_optima, unseen_problems
 from mapp_env import Grid
+from mapp_env.grids import find_grid
+from mapp_env.validation import check_choice, check_count, check_number
 
 REWARDS = ("manhattan", "geodesic", "step")
 N_ACTIONS = 4

@@ -30,9 +30,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.checks import check_count, check_number
-from baselines.episodes import Episodes, begin, draw_problems, make_envs, play
-from baselines.imitation import (
+from baselines.learning.imitation import (
     ImitationOptions,
     Pupil,
     good_actions_loss,
@@ -43,7 +41,9 @@ from baselines.imitation import (
     starting_point,
 )
 from baselines.networks import Network, NetworkSpec, split_joint
-from baselines.settings import Setting
+from baselines.policies.episodes import Episodes, begin, draw_problems, make_envs, play
+from baselines.policies.settings import Setting
+from mapp_env.validation import check_count, check_number
 
 ALGORITHM = "self_improve"
 MAX_AGAIN = 4096  # problems that wait to be played again; the oldest is forgotten

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 import tyro
 
-from baselines.evaluation import evaluate
-from baselines.policy import NetworkPolicy
-from baselines.settings import Setting
-from baselines.trained import load_trained
+from baselines.policies.evaluation import evaluate
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.settings import Setting
+from baselines.policies.trained import load_trained
 from mapp_env import Plan, Problem, replay, solve
 
 

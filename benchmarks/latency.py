@@ -28,11 +28,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from baselines.checks import check_grid
-from baselines.evaluation import Optima, evaluate, find_optima, rules_of_thumb
-from baselines.guidance import Acting
-from baselines.policy import NetworkPolicy, load_policy, pretrained_names
-from baselines.settings import Setting
+from baselines.policies.acting import Acting, check_grid
+from baselines.policies.evaluation import Optima, evaluate, find_optima, rules_of_thumb
+from baselines.policies.policy import NetworkPolicy, load_policy, pretrained_names
+from baselines.policies.settings import Setting
 from mapp_env import Problem, make_grid, replay, sample_problems, solve
 from mapp_env.solvers import optimal_costs
 from mapp_env.solvers.pyvrp import solve_pyvrp

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import mapp_env
 from mapp_env.adapters.sb3_vec import make_sb3_vec
-from mapp_env.central_env import CentralEnv
+from mapp_env.envs.central_env import CentralEnv
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # SuperSuit's own imports warn

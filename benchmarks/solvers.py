@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapp_env import Problem, make_grid
-from mapp_env.plan import OBJECTIVES
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact

@@ -35,11 +35,11 @@ import tyro
 from filelock import FileLock, Timeout
 
 from baselines import compare
-from baselines.checks import check_count
-from baselines.options import parse_options
-from baselines.runs import LOCK_FILE, StopSignals
-from baselines.studies import gather, last_line, make_folder
-from baselines.trials import Trial, check_folder
+from baselines.learning.config import parse_options
+from baselines.learning.study import gather, last_line, make_folder
+from baselines.learning.trials import Trial, check_folder
+from baselines.runs.folder import LOCK_FILE, StopSignals
+from mapp_env.validation import check_count
 
 ROOT = Path(__file__).resolve().parents[1]
 OBJECT_STORE_BYTES = 200_000_000  # a task returns one number

@@ -38,16 +38,17 @@ from ray.tune.schedulers import ASHAScheduler
 from ray.tune.search.basic_variant import BasicVariantGenerator
 from ray_seeds import start_ray
 
-from baselines.checks import check_count
-from baselines.evaluation import Evaluation, evaluate, find_optima, unseen_problems
-from baselines.experiment import training_problems
+from baselines.learning.config import preset_options
+from baselines.learning.experiment import training_problems
+from baselines.learning.training import Streams, Training
 from baselines.meta_dqn import Args as Options
 from baselines.meta_dqn import MetaLearner
-from baselines.options import preset_options
-from baselines.policy import NetworkPolicy, load_policy, save_policy
-from baselines.runs import WEIGHTS_FILE
-from baselines.settings import Setting, find_grid
-from baselines.training import Streams, Training
+from baselines.policies.evaluation import Evaluation, evaluate, find_optima, unseen_problems
+from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
+from baselines.policies.settings import Setting
+from baselines.runs.folder import WEIGHTS_FILE
+from mapp_env.grids import find_grid
+from mapp_env.validation import check_count
 
 METRIC = "excess %"
 TUNING_SEED = 1  # of the held-out problems

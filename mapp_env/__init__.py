@@ -15,14 +15,14 @@ import gymnasium
 import pettingzoo
 
 from mapp_env import mapp_v0, solvers
+from mapp_env.envs.vector_env import make_vec
 from mapp_env.files import FileError
 from mapp_env.grid import Grid
 from mapp_env.grids import grid_names, make_grid
 from mapp_env.map_format import MapError
-from mapp_env.plan import Plan, replay
+from mapp_env.plans.plan import Plan, replay
 from mapp_env.problem import Problem, sample_problems
 from mapp_env.solvers import solve
-from mapp_env.vector_env import make_vec
 
 __all__ = [
     "FileError",
@@ -49,13 +49,13 @@ def _register() -> None:
     if "mapp_env/Central-v0" not in gymnasium.registry:
         gymnasium.register(
             "mapp_env/Central-v0",
-            entry_point="mapp_env.central_env:CentralEnv",
-            vector_entry_point="mapp_env.vector_env:make_gymnasium_vec",
+            entry_point="mapp_env.envs.central_env:CentralEnv",
+            vector_entry_point="mapp_env.envs.vector_env:make_gymnasium_vec",
         )
     if "mapp_env/Tuple-v0" not in gymnasium.registry:
         gymnasium.register(
             "mapp_env/Tuple-v0",
-            entry_point="mapp_env.adapters.tuple_env:TupleEnv",
+            entry_point="mapp_env.envs.tuple_env:TupleEnv",
             disable_env_checker=True,  # it would warn that a list of rewards is no number
         )
     # PettingZoo has a registry from 1.27 on.

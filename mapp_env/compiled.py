@@ -21,11 +21,13 @@ __all__ = ["cache_files", "cache_folders", "is_compiled", "kernel", "nogil_kerne
 def _digest_sources() -> str:
     """Return a name for the present state of the package's sources, in a folder or a zip."""
     digest = hashlib.sha256()
-    package = resources.files(__package__)
-    for folder in (package, package / "solvers"):
-        for source in sorted(folder.iterdir(), key=lambda entry: entry.name):
-            if source.name.endswith(".py"):
-                digest.update(source.read_bytes())
+    folders = [resources.files(__package__)]
+    for folder in folders:
+        for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+            if entry.name.endswith(".py"):
+                digest.update(entry.read_bytes())
+            elif entry.is_dir():
+                folders.append(entry)
     return digest.hexdigest()[:12]
 
 

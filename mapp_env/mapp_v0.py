@@ -15,7 +15,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from mapp_env.parallel_env import MappParallelEnv
+from mapp_env.envs.parallel_env import MappParallelEnv
 
 __all__ = ["env", "parallel_env", "raw_env"]
 
@@ -61,7 +61,7 @@ class OrderedAECEnv(HasLimit, OrderEnforcingWrapper):
 def env(**arguments: Any) -> AECEnv[str, Any, Any]:
     """Return the environment in PettingZoo's AEC form, which refuses calls in the wrong order.
 
-    Parameters are those of :class:`mapp_env.parallel_env.MappParallelEnv`.
+    Parameters are those of :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
     """
     return OrderedAECEnv(MappAECEnv(parallel_env(**arguments)))
 

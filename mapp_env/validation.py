@@ -17,6 +17,7 @@ __all__ = [
     "check_choice",
     "check_count",
     "check_flag",
+    "check_number",
     "describe",
 ]
 
@@ -106,3 +107,17 @@ def check_flag(name: str, value: object) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {describe(value)}")
     return bool(value)
+
+
+def check_number(name: str, value: object, low: float, high: float) -> float:
+    """Return ``value`` as a ``float`` between ``low`` and ``high``, both included.
+
+    Raises
+    ------
+    ValueError
+        If ``value`` is not a finite number (a boolean is not) or out of range.
+    """
+    number = as_real(value)
+    if number is None or not low <= number <= high:
+        raise ValueError(f"{name} must be a number in {low:g}..{high:g}, got {describe(value)}")
+    return number

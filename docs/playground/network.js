@@ -1,5 +1,5 @@
 /*
- * The network "pairs" of baselines/networks.py, in 32-bit arithmetic, from the 16-bit weights in
+ * The network "pairs" of baselines/networks/__init__.py, in 32-bit arithmetic, from the 16-bit weights in
  * weights.js. Arrays of numbers are Float32Array throughout: what is stored there is rounded.
  */
 "use strict";

@@ -13,9 +13,9 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
-from mapp_env.parallel_env import MappParallelEnv
+from mapp_env.envs.parallel_env import MappParallelEnv
+from mapp_env.envs.vector_env import MAX_ENVS
 from mapp_env.validation import MAX_SEED, check_count, describe
-from mapp_env.vector_env import MAX_ENVS
 
 __all__ = ["SharedVecEnv", "make_sb3_shared"]
 
@@ -180,7 +180,7 @@ def make_sb3_shared(num_envs: int, **arguments: Any) -> SharedVecEnv:
     num_envs : int
         Number of environments, each with N agents: the ``VecEnv`` has ``num_envs * N`` rows.
     **arguments
-        Those of :class:`mapp_env.parallel_env.MappParallelEnv`, but that ``observation`` is
+        Those of :class:`mapp_env.envs.parallel_env.MappParallelEnv`, but that ``observation`` is
         ``"own_first"`` if it is not given: with ``"global"`` all agents see, and so do, the same.
 
     Raises

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
-from mapp_env.central_env import central_action_masks
+from mapp_env.engine.seeds import spread_seed
+from mapp_env.envs.central_env import central_action_masks
+from mapp_env.envs.vector_env import MappVectorEnv
+from mapp_env.envs.vector_infos import Transition
 from mapp_env.grid import pairs_of
-from mapp_env.row_seeds import spread_seed
 from mapp_env.validation import MAX_SEED, check_count, describe
-from mapp_env.vector_env import MappVectorEnv
-from mapp_env.vector_infos import Transition
 
 __all__ = ["MappSb3VecEnv", "make_sb3_vec"]
 
@@ -45,7 +45,7 @@ class MappSb3VecEnv(RowsVecEnv):
     num_envs : int
         Number of rows B, 1 to 1,048,576.
     **arguments
-        Those of :class:`mapp_env.vector_env.MappVectorEnv` but ``autoreset_mode``:
+        Those of :class:`mapp_env.envs.vector_env.MappVectorEnv` but ``autoreset_mode``:
         ``central_action="multi"`` (the default) gives ``MultiDiscrete`` actions, ``"joint"``
         numbered ones, which DQN needs. ``render_mode`` is ``"rgb_array"`` or None.
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mapp_env.files import check_writable
-from mapp_env.plan import Plan
+from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 

@@ -17,9 +17,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.central_env import CentralEnv
+from mapp_env.envs.central_env import CentralEnv
 from mapp_env.grid import Grid, tell_apart
-from mapp_env.plan import Plan, replay
+from mapp_env.plans.plan import Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 

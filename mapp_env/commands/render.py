@@ -37,7 +37,7 @@ from mapp_env.commands.reports import (
     landmarks_line,
     print_report,
 )
-from mapp_env.plan import OBJECTIVES, Plan, replay
+from mapp_env.plans.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers import solve
 from mapp_env.validation import check_count

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from mapp_env.plan import OBJECTIVES, Plan
+from mapp_env.plans.plan import OBJECTIVES, Plan
 from mapp_env.problem import Problem
 
 __all__ = [

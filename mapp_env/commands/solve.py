@@ -24,7 +24,7 @@ from mapp_env.commands.reports import (
     print_report,
 )
 from mapp_env.files import labelled
-from mapp_env.plan import OBJECTIVES, Plan
+from mapp_env.plans.plan import OBJECTIVES, Plan
 from mapp_env.solvers import METHODS, solve
 
 __all__ = ["add_arguments", "run"]

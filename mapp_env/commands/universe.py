@@ -20,7 +20,7 @@ import numpy as np
 from mapp_env.commands.problem_options import N_AGENTS, N_LANDMARKS, add_grid_options, grid_of
 from mapp_env.commands.reports import add_json_option, print_report, words
 from mapp_env.grid import Grid
-from mapp_env.plan import OBJECTIVES
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.solvers import solve_universe
 
 __all__ = ["add_arguments", "run"]

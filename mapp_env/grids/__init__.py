@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import inspect
+import os
+from collections.abc import Mapping
 from functools import cache
 from importlib import resources
 from typing import Any
 
 from mapp_env.grid import Grid
 from mapp_env.grids.generators import GENERATORS
-from mapp_env.validation import check_choice
+from mapp_env.validation import check_choice, describe
 
-__all__ = ["generator_names", "grid_names", "make_grid"]
+__all__ = ["find_grid", "generator_names", "grid_names", "make_grid"]
 
 
 @cache
@@ -66,3 +68,37 @@ def make_grid(name: str = "paper-7x7", **options: Any) -> Grid:
 def _load(name: str) -> Grid:
     """Read a bundled grid once: grids are frozen, so that all users can share one."""
     return Grid.from_text(resources.files(__name__).joinpath(f"{name}.txt").read_text("ascii"))
+
+
+def find_grid(grid: object) -> Grid:
+    """Return the grid meant by a grid, a bundled name or a path to a map file.
+
+    A dict of a grid's text is one, too: what is left of a grid in the JSON of an environment's
+    spec.
+
+    Raises
+    ------
+    ValueError
+        If ``grid`` is none of them, or the file cannot be used.
+    """
+    if isinstance(grid, Grid):
+        return grid
+    if isinstance(grid, Mapping) and set(grid) == {"text"}:
+        try:
+            return Grid.from_text(grid["text"])
+        except ValueError as error:
+            raise ValueError(f"grid: {error}") from error
+    if isinstance(grid, str) and grid in grid_names():
+        return make_grid(grid)
+    if isinstance(grid, os.PathLike) or (isinstance(grid, str) and os.path.lexists(grid)):
+        return Grid.load(grid)
+    if isinstance(grid, str) and grid in generator_names():
+        raise ValueError(
+            f"grid must be a mapp_env.Grid, a bundled name or a map file: "
+            f"mapp_env.make_grid({grid!r}) generates one; got {grid!r}"
+        )
+    missing = ", and there is no such file" if isinstance(grid, str) else ""
+    raise ValueError(
+        f"grid must be a mapp_env.Grid, a bundled name ({', '.join(grid_names())}) or a path to a "
+        f"map file; got {describe(grid, 320)}{missing}"
+    )

@@ -14,11 +14,12 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from mapp_env.engine.scene import Scene
+
 # Not lazy, as a submodule of the same name would otherwise hide the function once imported; these
 # files load Pillow only when they draw.
 from mapp_env.rendering.ansi import ansi
 from mapp_env.rendering.rgb_array import rgb_array
-from mapp_env.scene import Scene
 
 if TYPE_CHECKING:
     from mapp_env.rendering.animation import save_animation, save_gif

@@ -11,13 +11,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mapp_env.engine.scene import Scene
+from mapp_env.engine.simulation import Simulation
+from mapp_env.engine.task import Task
 from mapp_env.files import check_writable, write_bytes
-from mapp_env.plan import replay
+from mapp_env.plans.plan import replay
 from mapp_env.problem import Problem
 from mapp_env.rendering.rgb_array import rgb_array
-from mapp_env.scene import Scene
-from mapp_env.simulation import Simulation
-from mapp_env.task import Task
 from mapp_env.validation import check_count, check_flag, describe
 
 __all__ = ["MAX_FRAMES", "MAX_PIXELS", "save_animation", "save_gif", "scenes"]

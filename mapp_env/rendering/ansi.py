@@ -6,7 +6,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from mapp_env.scene import Scene
+from mapp_env.engine.scene import Scene
 
 __all__ = ["ansi"]
 

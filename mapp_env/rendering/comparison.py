@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from matplotlib.figure import Figure
 
 from mapp_env.files import check_writable
-from mapp_env.plan import Plan
+from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering.figures import DPI, Panel, costs_of, draw_plan, save_figure
 from mapp_env.rendering.palette import INK, to_hex

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mapp_env.grid import Grid
-    from mapp_env.plan import Plan
+    from mapp_env.plans.plan import Plan
     from mapp_env.problem import Problem
 
 __all__ = ["FORMATS", "Panel", "costs_of", "draw_plan", "save_figure"]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mapp_env.engine.scene import TRAIL_MOVES, Scene
 from mapp_env.rendering import icons
 from mapp_env.rendering.palette import (
     CHECK,
@@ -27,7 +28,6 @@ from mapp_env.rendering.palette import (
     agent_colour,
     blend,
 )
-from mapp_env.scene import TRAIL_MOVES, Scene
 
 if TYPE_CHECKING:
     from mapp_env.grid import Grid

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from mapp_env.plan import Plan
+from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 

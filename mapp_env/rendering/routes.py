@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mapp_env.grid import Grid
-    from mapp_env.plan import Plan
+    from mapp_env.plans.plan import Plan
 
 __all__ = ["DASHES", "draw_routes"]
 

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.plan import Plan
+from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering import icons
 from mapp_env.rendering.animation import save_gif, scenes

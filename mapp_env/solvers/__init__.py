@@ -7,7 +7,8 @@ import time
 from dataclasses import replace
 
 from mapp_env.grid import Grid
-from mapp_env.plan import OBJECTIVES, Plan, replay
+from mapp_env.plans.plan import OBJECTIVES, Plan, replay
+from mapp_env.plans.walking import tour_through, walk_tours
 from mapp_env.problem import Problem
 from mapp_env.solvers.batch import optimal_costs
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, check_exact, solve_exact
@@ -15,7 +16,6 @@ from mapp_env.solvers.solution import Routes, Solution, Solver
 from mapp_env.solvers.universe import solve_universe
 from mapp_env.solvers.vrplib import save_vrplib
 from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, describe
-from mapp_env.walking import tour_through, walk_tours
 
 __all__ = ["METHODS", "Solution", "optimal_costs", "save_vrplib", "solve", "solve_universe"]
 

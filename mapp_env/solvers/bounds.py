@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.plan import OBJECTIVES
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem
 from mapp_env.solvers.families import smallest_limit
 from mapp_env.solvers.held_karp import route_tables

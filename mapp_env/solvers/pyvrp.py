@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.plan import OBJECTIVES
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.distances import landmark_distances

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.grid import Grid
-from mapp_env.plan import OBJECTIVES
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
 from mapp_env.solvers.batch import CHUNK_WORK, MAX_BATCH_LANDMARKS, Workspace, solve_rows
 from mapp_env.solvers.distances import cell_distances

@@ -1,0 +1,1 @@
+"""What the trainings share: options, driver, targets and losses."""

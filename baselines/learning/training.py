@@ -1,0 +1,284 @@
+"""A training: problems one after the other, episode by episode, whoever learns.
+
+It advances by one step or one update at a time, and between any two of them it can be stopped,
+saved and carried on, to the same bytes.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from baselines.learning.config import Options
+from baselines.policies.guidance import Guidance, LinearSchedule
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.settings import N_ACTIONS
+from baselines.runs.folder import Stopwatch
+from mapp_env import Grid, mapp_v0
+
+METRICS = (
+    *("episode", "problem", "steps", "reward", "solved", "epsilon", "guidance"),
+    *("updates", "loss"),
+)
+
+
+class Learner(Protocol):
+    """What is trained."""
+
+    updates: int
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return the greedy joint action (N,)."""
+        ...
+
+    def remember(
+        self,
+        observation: np.ndarray,
+        actions: np.ndarray,
+        reward: float,
+        next_observation: np.ndarray,
+        terminated: bool,
+    ) -> None:
+        """Take note of a transition."""
+        ...
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to learn from."""
+        ...
+
+    def update(self, progress: float) -> float:
+        """Learn from one batch; return the loss."""
+        ...
+
+    def policy(self) -> NetworkPolicy:
+        """Return what was learned."""
+        ...
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Return all else that changes, ready for JSON."""
+        ...
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what the two above returned."""
+        ...
+
+
+class Streams(NamedTuple):
+    """A stream for everything random, so that one more draw here moves nothing there."""
+
+    network: np.random.SeedSequence
+    problems: np.random.SeedSequence
+    acting: np.random.SeedSequence
+    replay: np.random.SeedSequence
+
+    @classmethod
+    def spawn(cls, seed: int) -> "Streams":
+        """Derive the streams from the seed of a run."""
+        return cls(*np.random.SeedSequence(seed).spawn(len(cls._fields)))
+
+
+@dataclass
+class Progress:
+    """Where a training stands, to the step and to the update."""
+
+    episodes: int = 0  # finished
+    steps: int = 0  # played, in all
+    actions: list[list[int]] = field(default_factory=list)  # of the episode so far
+    pending: int = 0  # updates that are due
+    over: bool = False  # whether the episode has ended, but for its updates
+    solved: bool = False
+    reward: float = 0.0  # of the episode so far
+    epsilon: float = 0.0
+    losses: float = 0.0  # of the episode, summed
+    updates: int = 0  # of the episode
+
+
+class Training:
+    """A training that can be stopped between any two steps or updates, and carried on.
+
+    Parameters
+    ----------
+    args
+        Options.
+    grid
+        The grid.
+    problems
+        (P, K) landmark cells, a training problem per row.
+    learner
+        What is trained.
+    """
+
+    def __init__(self, args: Options, grid: Grid, problems: np.ndarray, learner: Learner) -> None:
+        self.args, self.problems, self.learner = args, problems, learner
+        self.env = mapp_v0.parallel_env(
+            grid=grid,
+            n_agents=args.n_agents,
+            n_landmarks=args.n_landmarks,
+            max_cycles=args.max_cycles,
+            reward=args.reward,
+        )
+        self.leader = self.env.possible_agents[0]  # all see the same and are rewarded the same
+        self.rng = np.random.default_rng(Streams.spawn(args.seed).acting)
+        self.guidance = Guidance(grid, args.n_agents, args.n_landmarks, args.guidance_reach)
+        self.epsilon_at = LinearSchedule(args.epsilon_start, args.epsilon_end, args.epsilon_steps)
+        self.guidance_at = LinearSchedule(
+            args.guidance_start, args.guidance_end, round(args.guidance_fraction * args.n_episodes)
+        )
+        self.now = Progress()
+        self.watch = Stopwatch()
+        self.observation = self._reset()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all episodes are over."""
+        return self.now.episodes >= self.args.n_episodes
+
+    @property
+    def problem(self) -> int:
+        """Index of the problem that is being trained on."""
+        return self.now.episodes // self.args.episodes_per_problem
+
+    def advance(self) -> dict[str, object] | None:
+        """Carry out one update or one step; return the row of an episode that it ends."""
+        now, args = self.now, self.args
+        if now.pending:
+            # An episode's updates are spread evenly over it.
+            done = now.episodes
+            if args.updates_per_episode:
+                done += 1 - now.pending / max(args.updates_per_episode, now.pending)
+            now.losses += self.learner.update(done / args.n_episodes)
+            now.updates += 1
+            now.pending -= 1
+            self.watch.lap("update")
+        elif not now.over:
+            self._step()
+        return self._end_episode() if now.over and not now.pending else None
+
+    def _step(self) -> None:
+        now, args = self.now, self.args
+        now.epsilon = self.epsilon_at(now.steps)
+        actions = self._choose(now.epsilon)
+        self.watch.lap("network acts")
+        influence = self.guidance_at(now.episodes)
+        seen = self.observation
+        if influence > 0.0:
+            actions = self.guidance.apply(actions[None], seen[None], influence, self.rng)[0]
+        self.watch.lap("guidance")
+        following, reward, terminated, truncated = self._play(actions.tolist())
+        self.watch.lap("env")
+        self.learner.remember(seen, actions, reward, following, terminated)
+        self.observation = following
+        now.actions.append(actions.tolist())
+        now.reward += reward
+        now.steps += 1
+        now.solved, now.over = terminated, terminated or truncated
+        if now.steps >= args.learning_starts and self.learner.ready:
+            if args.update_interval and now.steps % args.update_interval == 0:
+                now.pending += 1
+            if now.over:
+                now.pending += args.updates_per_episode
+        self.watch.lap("memory")
+
+    def _choose(self, epsilon: float) -> np.ndarray:
+        """Return an epsilon-greedy joint action (N,): each agent tosses its own coin."""
+        n_agents = self.args.n_agents
+        random_actions = self.rng.integers(N_ACTIONS, size=n_agents)
+        explores = self.rng.random(n_agents) < epsilon
+        if explores.all():
+            return random_actions
+        return np.where(explores, random_actions, self.learner.act(self.observation))
+
+    def _play(self, actions: list[int]) -> tuple[np.ndarray, float, bool, bool]:
+        commands = dict(zip(self.env.agents, actions, strict=True))
+        seen, rewards, terminations, truncations, _ = self.env.step(commands)
+        leader = self.leader
+        return seen[leader], rewards[leader], terminations[leader], truncations[leader]
+
+    def _reset(self) -> np.ndarray:
+        problem = min(self.problem, len(self.problems) - 1)
+        seen, _ = self.env.reset(options={"landmarks": self.problems[problem].tolist()})
+        observation: np.ndarray = seen[self.leader]
+        return observation
+
+    def _end_episode(self) -> dict[str, object]:
+        now = self.now
+        row: dict[str, object] = {
+            "episode": now.episodes + 1,
+            "problem": self.problem + 1,
+            "steps": len(now.actions),
+            "reward": now.reward,
+            "solved": int(now.solved),
+            "epsilon": now.epsilon,  # at the episode's last step
+            "guidance": self.guidance_at(now.episodes),
+            "updates": now.updates,
+            "loss": now.losses / now.updates if now.updates else "",
+        }
+        self.now = Progress(episodes=now.episodes + 1, steps=now.steps)
+        self.observation = self._reset()
+        self.watch.lap("env")
+        return row
+
+    # -- checkpoints
+
+    @property
+    def number(self) -> int:
+        """Steps and updates so far."""
+        return self.now.steps + self.learner.updates
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+        return self.learner.arrays()
+
+    def state(self) -> dict[str, Any]:
+        """Return all else that changes, ready for JSON."""
+        return {
+            "progress": asdict(self.now),
+            "observation": self.observation.tolist(),
+            "rng": self.rng.bit_generator.state,
+            "learner": self.learner.state(),
+            "seconds": self.watch.seconds,
+        }
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what :meth:`arrays` and :meth:`state` returned.
+
+        What follows from the actions is not taken over: the episode so far is played again, as the
+        rules leave nothing to chance.
+
+        Raises
+        ------
+        ValueError
+            If something that must be there is not.
+        """
+        self.now = now = Progress(**state["progress"])
+        self.rng.bit_generator.state = state["rng"]
+        self.learner.restore(arrays, state["learner"])
+        self.watch.seconds = dict(state["seconds"])
+        self.observation = self._reset()
+        now.reward, now.solved, now.over = 0.0, False, False
+        for actions in now.actions:
+            self.observation, reward, now.solved, truncated = self._play(actions)
+            now.reward += reward
+            now.over = now.solved or truncated
+
+    def check_metrics(self, table: dict[str, list[float]]) -> None:
+        """Compare where it stands with the rows of its finished episodes.
+
+        Raises
+        ------
+        ValueError
+            If they differ.
+        """
+        now = self.now
+        finished = now.episodes, now.steps - len(now.actions), self.learner.updates - now.updates
+        logged = len(table["episode"]), sum(table["steps"]), sum(table["updates"])
+        if finished != logged:
+            raise ValueError(
+                f"finished episodes, their steps and updates are {finished} by it, and {logged} by "
+                "metrics.csv"
+            )

@@ -1,0 +1,5 @@
+"""Policies, and how they are judged."""
+
+from baselines.policies.policy import load_policy
+
+__all__ = ["load_policy"]

@@ -1,0 +1,104 @@
+"""Episodes of a meta-agent on many problems at once, greedy or drawn from its policy."""
+
+from typing import NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+
+from baselines.networks import Network, split_joint
+from baselines.policies.settings import Setting
+from mapp_env import make_vec
+from mapp_env.grid import pairs_of
+
+
+class Episodes(NamedTuple):
+    """One episode on each of P problems; zero after its end."""
+
+    observations: np.ndarray  # (T, P, N + 2K) float32
+    joint: np.ndarray  # (T, P) int64, joint actions
+    lengths: np.ndarray  # (P,) int64 steps until all was visited, the limit + 1 if it was not
+
+
+def make_envs(setting: Setting, n_rows: int, max_length: int) -> gymnasium.vector.VectorEnv:
+    """Return environments for :func:`play`, which gives them their problems."""
+    return make_vec(
+        n_rows,
+        autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
+        grid=setting.grid,
+        n_agents=setting.n_agents,
+        n_landmarks=setting.n_landmarks,
+        max_cycles=max_length,
+    )
+
+
+def begin(
+    envs: gymnasium.vector.VectorEnv, landmarks: np.ndarray, seed: int | None = None
+) -> np.ndarray:
+    """Start an episode on each row of landmarks (P, K); return what is seen, (P, N + 2K)."""
+    # As pairs: two rows of two cells could as well be two pairs.
+    pairs = pairs_of(envs.unwrapped.task.grid, landmarks)  # type: ignore[attr-defined]
+    observations: np.ndarray = envs.reset(seed=seed, options={"landmarks": pairs})[0]
+    return observations
+
+
+def play(
+    envs: gymnasium.vector.VectorEnv,
+    network: Network,
+    landmarks: np.ndarray,
+    max_length: int,
+    sharpness: float,
+    greedy: np.ndarray,
+    rng: np.random.Generator,
+) -> Episodes:
+    """Play an episode on each row of landmarks.
+
+    Parameters
+    ----------
+    envs
+        As many environments as there are rows.
+    network
+        Its values, times the sharpness, are the logits of the actions.
+    landmarks
+        (P, K), each row ascending.
+    max_length
+        Steps after which an episode is given up.
+    sharpness
+        See above.
+    greedy
+        (P,) bool, rows that take the action of the largest value.
+    rng
+        Source of all draws.
+    """
+    seen = begin(envs, landmarks)
+    spec, n_rows = network.spec, len(landmarks)
+    playing = np.arange(n_rows)
+    lengths = np.full(n_rows, max_length + 1)
+    observations, actions = [], []
+    for step in range(1, max_length + 1):
+        here = np.zeros_like(seen)
+        here[playing] = seen[playing]
+        with torch.inference_mode():
+            scores = network(torch.from_numpy(seen[playing])).numpy()
+        # The largest of logits and Gumbel noise is a draw from the policy.
+        chance = rng.standard_exponential(scores.shape, np.float32)
+        noise = -np.log(np.maximum(chance, np.finfo(np.float32).tiny))
+        noise[greedy[playing]] = 0.0
+        joint = np.zeros(n_rows, np.int64)
+        joint[playing] = (sharpness * scores + noise).argmax(axis=1)
+        observations.append(here)
+        actions.append(joint)
+        seen, _, terminated, _, _ = envs.step(split_joint(joint, spec.n_agents, spec.n_actions))
+        lengths[playing[terminated[playing]]] = step
+        playing = playing[~terminated[playing]]
+        if not len(playing):
+            break
+    return Episodes(np.stack(observations), np.stack(actions), lengths)
+
+
+def draw_problems(
+    cells: np.ndarray, n_landmarks: int, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return random sets of landmarks (count, K) in the order that environments give them in."""
+    drawn = rng.random((count, len(cells))).argpartition(n_landmarks - 1, axis=1)
+    return np.sort(cells[drawn[:, :n_landmarks]], axis=1)

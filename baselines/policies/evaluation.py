@@ -1,0 +1,348 @@
+"""How good a policy is: what it costs on many problems, beside the proven optimum of each.
+
+A problem is solved when every landmark was visited within the step limit. The gap of a solved
+problem is (cover time - optimum) / optimum; optima are proven up to 20 landmarks.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from baselines.policies.acting import Acting, check_grid
+from baselines.policies.episodes import begin
+from baselines.policies.policy import MAX_TABLE_CELLS, EarliestArrivalPolicy, NearestLandmarkPolicy
+from baselines.policies.settings import Setting
+from mapp_env import Problem, make_vec, sample_problems, solve
+from mapp_env.files import write_text
+from mapp_env.solvers import optimal_costs, solve_universe
+from mapp_env.validation import check_count
+
+# Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
+# from streams spawned from their own seeds; those that coincide are left out one by one.
+EVALUATION_SEED = 0
+BATCH = 4096  # problems played at a time
+N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
+OBJECTIVES = ("cover_time", "makespan", "total_distance")
+MAX_TABLE_BYTES = 1 << 20
+MAX_BATCH_LANDMARKS = 12  # of optimal_costs()
+MAX_EXACT_LANDMARKS = 20  # of solve(method="exact")
+
+
+# -- problems ----------------------------------------------------------------------------------
+
+
+def unseen_problems(
+    setting: Setting,
+    n_problems: int,
+    seen: Sequence[Sequence[int]] = (),
+    seed: int = EVALUATION_SEED,
+) -> np.ndarray:
+    """Draw distinct problems, none of them in `seen` (in whatever order): (n_problems, K)."""
+    return sample_problems(
+        setting.grid, n_problems, n_landmarks=setting.n_landmarks, seed=seed, exclude=seen
+    )
+
+
+def count_problems(setting: Setting) -> int:
+    """Return how many problems of the setting there are."""
+    return math.comb(setting.grid.reachable.size, setting.n_landmarks)
+
+
+def count_unseen(setting: Setting, seen: Sequence[Sequence[int]]) -> int:
+    """Return how many problems of the setting there are besides those in `seen`."""
+    return count_problems(setting) - len({tuple(sorted(landmarks)) for landmarks in seen})
+
+
+def every_problem(setting: Setting) -> np.ndarray:
+    """Return the universe of a setting, in lexicographic order: (P, K).
+
+    Raises
+    ------
+    ValueError
+        If it is too large to be listed.
+    """
+    return solve_universe(setting.grid, setting.n_landmarks, setting.n_agents)[0]
+
+
+# -- optima ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Optima:
+    """The proven optimum of P problems in each objective, every objective by itself."""
+
+    cover_time: np.ndarray  # (P,) int32
+    makespan: np.ndarray  # (P,) int32
+    total_distance: np.ndarray  # (P,) int32
+
+
+def find_optima(setting: Setting, landmarks: np.ndarray) -> Optima | None:
+    """Return the optima of problems (P, K); None if K is more than the exact solver takes."""
+    if setting.n_landmarks > MAX_EXACT_LANDMARKS:
+        return None
+    return Optima(*(_optimal_costs(setting, landmarks, objective) for objective in OBJECTIVES))
+
+
+def out_of_reach(setting: Setting, optima: Optima | None) -> list[str]:
+    """Return a line on problems whose optimum already takes more than the step limit, if any."""
+    if optima is None:
+        return []
+    count = int((optima.cover_time > setting.max_cycles).sum())
+    if count == 0:
+        return []
+    return [
+        f"out of reach: {count:,} of {len(optima.cover_time):,} problems take more than "
+        f"{setting.max_cycles} steps at their optimum (the limit is --max-cycles)"
+    ]
+
+
+def _optimal_costs(setting: Setting, landmarks: np.ndarray, objective: str) -> np.ndarray:
+    if setting.n_landmarks <= MAX_BATCH_LANDMARKS:
+        return optimal_costs(setting.grid, landmarks, setting.n_agents, objective)
+    rows = tqdm(landmarks.tolist(), desc=f"optima: {objective}", leave=False, disable=None)
+    problems = (Problem(setting.grid, row, setting.n_agents) for row in rows)
+    return np.array([solve(problem, objective, "exact").cost for problem in problems], np.int32)
+
+
+# -- rules of thumb ----------------------------------------------------------------------------
+
+RULES = {
+    "nearest": ("nearest landmark", NearestLandmarkPolicy),
+    "earliest": ("earliest arrival", EarliestArrivalPolicy),
+}
+"""Rules without a network by what commands call them: how tables call them, and who they are."""
+
+
+def rules_of_thumb(setting: Setting) -> dict[str, Acting]:
+    """Return the rules that every table has beside the policies, by how tables call them.
+
+    There are none, and a line says so, on a grid for which the distances of all pairs of cells are
+    not kept.
+    """
+    if setting.grid.n_cells > MAX_TABLE_CELLS:
+        names = " and ".join(label for label, _ in RULES.values())
+        print(f"no rows for {names}: the grid has more than {MAX_TABLE_CELLS:,} cells")
+        return {}
+    task = setting.grid, setting.n_agents, setting.n_landmarks
+    return {label: rule(*task) for label, rule in RULES.values()}
+
+
+# -- playing -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What came out on P problems; costs are infinite where not every landmark was visited."""
+
+    setting: Setting
+    landmarks: np.ndarray  # (P, K) int32
+    success: np.ndarray  # (P,) bool
+    steps: np.ndarray  # (P,) int64, until the last landmark or the step limit
+    cover_time: np.ndarray  # (P,) float64
+    makespan: np.ndarray  # (P,) float64, the way home included (R8)
+    total_distance: np.ndarray  # (P,) float64, the way home included (R8)
+    actions: np.ndarray  # (T, kept, N) int8, of the first problems; p took steps[p] of them
+    optima: Optima | None = None  # None: too many landmarks for a proven optimum
+
+    def __post_init__(self) -> None:
+        for objective in OBJECTIVES if self.optima is not None else ():
+            short = getattr(self, objective) < getattr(self.optima, objective)
+            if short.any():
+                landmarks = self.landmarks[short.argmax()].tolist()
+                raise RuntimeError(f"a {objective} below the proven optimum, landmarks {landmarks}")
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """Gaps of the cover time, (P,) float64: infinite where unsolved, NaN without optima."""
+        if self.optima is None:
+            return np.full(len(self.success), np.nan)
+        return self.cover_time / self.optima.cover_time - 1.0
+
+    def summary(self) -> dict[str, float]:
+        """Figures in the order of the table's columns; NaN where there is none.
+
+        Gaps and costs are those of the solved problems; "optimal %" counts among all problems.
+        """
+
+        def over_solved(values: np.ndarray, reduce: str = "mean") -> float:
+            solved = values[self.success]
+            return float(getattr(solved, reduce)()) if len(solved) else math.nan
+
+        # Infinite gaps are above 0, NaN stays NaN.
+        optimal = np.where(np.isnan(self.gaps), np.nan, self.gaps <= 0.0)
+        return {
+            "problems": len(self.success),
+            "solved %": 100.0 * float(self.success.mean()),
+            "gap %": 100.0 * over_solved(self.gaps),
+            "optimal %": 100.0 * float(optimal.mean()),
+            "worst gap %": 100.0 * over_solved(self.gaps, "max"),
+            "cover time": over_solved(self.cover_time),
+            f"unsolved = {self.setting.max_cycles}": float(self.steps.mean()),
+            "makespan": over_solved(self.makespan),
+            "total distance": over_solved(self.total_distance),
+        }
+
+
+def evaluate(
+    policy: Acting,
+    setting: Setting,
+    landmarks: np.ndarray,
+    optima: Optima | None = None,
+    n_kept: int = 0,
+    progress: str | None = None,
+) -> Evaluation:
+    """Let a policy play each problem once.
+
+    Parameters
+    ----------
+    policy
+        Who commands the agents.
+    setting
+        Grid, number of agents and landmarks, step limit.
+    landmarks
+        (P, K) landmark cells, a problem per row.
+    optima
+        Of these problems, from :func:`find_optima`; without them there are no gaps.
+    n_kept
+        Of how many problems, the first ones, the joint actions are kept, to be replayed or drawn.
+    progress
+        Label of a progress bar, shown in a terminal; none by default.
+
+    Raises
+    ------
+    ValueError
+        If there is no problem, one is not a problem of the grid, or the policy is of another grid.
+    """
+    check_count("n_kept", n_kept, 0, 1_000_000)
+    check_grid(policy, setting.grid)
+    landmarks = np.asarray(landmarks)
+    if landmarks.ndim != 2 or landmarks.shape[0] == 0 or landmarks.shape[1] != setting.n_landmarks:
+        raise ValueError(
+            f"landmarks must be cells of shape (P, {setting.n_landmarks}) with P at least 1, got "
+            f"shape {landmarks.shape}"
+        )
+    n_problems = len(landmarks)
+    n_kept = min(n_kept, n_problems)
+    batch = min(BATCH, n_problems)
+    envs = make_vec(
+        batch,
+        autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
+        grid=setting.grid,
+        n_agents=setting.n_agents,
+        n_landmarks=setting.n_landmarks,
+        max_cycles=setting.max_cycles,
+    )
+    costs = {name: np.full(n_problems, np.inf) for name in OBJECTIVES}
+    success = np.zeros(n_problems, np.bool_)
+    steps = np.zeros(n_problems, np.int64)
+    kept = np.zeros((setting.max_cycles, n_kept, setting.n_agents), np.int8)
+    bar = tqdm(
+        total=n_problems,
+        desc=progress,
+        unit=" problems",
+        leave=False,
+        disable=True if progress is None else None,  # None: if there is no terminal
+    )
+    for start in range(0, n_problems, batch):
+        # The last batch is filled up with problems played before; they are not read again.
+        rows = np.minimum(np.arange(start, start + batch), n_problems - 1)
+        playing = np.arange(batch) < n_problems - start
+        observations = begin(envs, landmarks[rows], seed=0)
+        actions = np.zeros((batch, setting.n_agents), np.int64)
+        step = 0
+        while playing.any():
+            actions[playing] = policy.act(observations[playing])
+            if start < n_kept:
+                drawn = playing & (rows < n_kept)
+                kept[step, rows[drawn]] = actions[drawn]
+            observations, _, terminated, truncated, infos = envs.step(actions)
+            step += 1
+            ended = playing & (terminated | truncated)
+            if ended.any():
+                steps[rows[ended]] = step
+                success[rows[ended]] = infos["metrics"]["success"][ended]
+                for name, cost in costs.items():
+                    cost[rows[ended]] = infos["metrics"][name][ended]
+                bar.update(int(ended.sum()))
+            playing &= ~ended  # what the row plays after its reset is nobody's problem
+    bar.close()
+    envs.close()
+    return Evaluation(
+        setting=setting,
+        landmarks=landmarks,
+        success=success,
+        steps=steps,
+        **costs,
+        actions=kept,
+        optima=optima,
+    )
+
+
+# -- tables ------------------------------------------------------------------------------------
+
+
+def table_rows(evaluations: dict[str, Evaluation]) -> dict[str, dict[str, float]]:
+    """Return the figures of each policy, and a last row of the optima, if they are known."""
+    rows = {label: evaluation.summary() for label, evaluation in evaluations.items()}
+    first = next(iter(evaluations.values()))
+    if first.optima is not None:
+        costs = {name: float(getattr(first.optima, name).mean()) for name in OBJECTIVES}
+        figures = (
+            *(len(first.success), 100.0, 0.0, 100.0, 0.0),
+            *(costs["cover_time"], costs["cover_time"], costs["makespan"]),
+            costs["total_distance"],
+        )
+        rows["optimum of each cost"] = dict(zip(first.summary(), figures, strict=True))
+    return rows
+
+
+def format_table(evaluations: dict[str, Evaluation]) -> str:
+    """Return a Markdown table, a row per policy, and the optimum."""
+    rows = table_rows(evaluations)
+    lines = [["policy", *next(iter(rows.values()))]]
+    for label, figures in rows.items():
+        lines.append([label, *(_format_cell(name, value) for name, value in figures.items())])
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    texts = [
+        "| "
+        + " | ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
+        )
+        + " |"
+        for line in lines
+    ]
+    ruler = "|" + "|".join("-" * (w + 1) + (":" if c else "-") for c, w in enumerate(widths)) + "|"
+    return "\n".join([texts[0], ruler, *texts[1:]])
+
+
+def _format_cell(name: str, value: float) -> str:
+    if math.isnan(value):
+        return "-"
+    if name == "problems":
+        return f"{value:.0f}"
+    if not name.endswith("%"):
+        return f"{value:.2f}"
+    # 99.9998 % is not 100 %: rounded away from what would say too much.
+    # (5.1 * 100 is 509.999...)
+    whole = math.floor(value * 100 + 1e-6) / 100 if name in ("solved %", "optimal %") else value
+    return f"{whole:.2f}"
+
+
+def save_table(folder: Path, evaluations: dict[str, Evaluation]) -> None:
+    """Write evaluation.csv (all digits) and evaluation.md (the printed table)."""
+    rows = table_rows(evaluations)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["policy", *next(iter(rows.values()))])
+    for label, figures in rows.items():
+        writer.writerow([label, *figures.values()])
+    write_text(folder / "evaluation.csv", text.getvalue(), MAX_TABLE_BYTES)
+    write_text(folder / "evaluation.md", format_table(evaluations) + "\n", MAX_TABLE_BYTES)

@@ -1,0 +1,1 @@
+"""What is learned from: transitions stored, relabelled or imagined."""

@@ -1,0 +1,1 @@
+"""The rules and what runs them, over arrays: no PettingZoo, no Gymnasium."""

@@ -1,0 +1,247 @@
+"""Problems in progress: the state of B rows."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.engine.loops import (
+    fill_fields,
+    find_bad_action,
+    measure_rows,
+    observe_rows,
+    reset_rows,
+    step_rows,
+)
+from mapp_env.engine.rules import row_length
+from mapp_env.engine.scene import TRAIL_MOVES, Scene
+from mapp_env.engine.task import Task
+from mapp_env.problem import MAX_CYCLES
+
+__all__ = ["Rows"]
+
+
+class Rows:
+    """The state of B problems of one task.
+
+    Parameters
+    ----------
+    task : Task
+        What is played.
+    n_rows : int
+        Number of problems B.
+    n_views : int
+        Observations V of a row: the number of agents, or 1 for the global one once.
+
+    Attributes
+    ----------
+    state : ndarray of int32, shape (B, row_length)
+        See :mod:`mapp_env.engine.rules`.
+    limits : ndarray of int64, shape (B,)
+        Step limit of each row's episode.
+    max_cycles : int
+        Step limit of the episodes to come that do not bring their own.
+    longest : int
+        Upper bound of every step limit, whoever sets it.
+    """
+
+    def __init__(self, task: Task, n_rows: int, n_views: int) -> None:
+        self.task = task
+        self.n_rows = n_rows
+        self.state = np.zeros((n_rows, row_length(task.n_agents, task.n_landmarks)), np.int32)
+        self.limits = np.full(n_rows, task.max_cycles, np.int64)
+        self.max_cycles = task.max_cycles
+        self.longest = MAX_CYCLES
+        self._every_row = np.arange(n_rows)
+        # What the kernels take at every call, gathered once: for a single row, looking it up would
+        # take longer than a step.
+        n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
+        self._fields = np.empty((n_fields, task.grid.n_cells), np.int32)
+        self.sizes = (task.n_agents, task.n_landmarks)
+        self.reward = int(task.reward_kind)
+        self.kind = int(task.observation_kind)
+        self.tables = self._find_tables()
+        self.views_shape = (n_views, task.view.low.size)
+        self.masks_shape = (task.n_agents, task.n_actions)
+        self._looked_at: NDArray[np.int64] | None = None
+        # Pictures show where agents have been: their cells at each step, for each row.
+        self._trails: list[deque[tuple[int, ...]]] | None = None
+        if task.render_mode is not None:
+            self._trails = [deque(maxlen=TRAIL_MOVES + 1) for _ in range(n_rows)]
+
+    def _find_tables(self) -> tuple[Any, ...]:
+        """Return the table and the distances of reward and views that the kernels read."""
+        task, fields = self.task, self._fields
+        return (task.table, *task.reward_distances(fields), *task.view_distances(fields))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy; what the kernels read must be views of it, not copies of views."""
+        self.__dict__.update(state)
+        self.tables = self._find_tables()
+
+    def start(
+        self,
+        indices: NDArray[np.int64],
+        words: NDArray[np.uint64] | None,
+        landmarks: NDArray[np.int32] | None = None,
+        limit: int | None = None,
+    ) -> None:
+        """Start an episode in some rows.
+
+        Parameters
+        ----------
+        indices : ndarray of int64, shape (M,)
+            The rows.
+        words : ndarray of uint64, shape (M,), or None
+            Random words that the landmarks are drawn from.
+        landmarks : ndarray of int32, shape (M, K), optional
+            The landmarks, if they are not to be drawn.
+        limit : int, optional
+            Step limit of these episodes; by default ``max_cycles``.
+        """
+        task = self.task
+        if landmarks is None:
+            landmarks = np.empty((len(indices), task.n_landmarks), np.int32)
+        else:
+            words = None
+        reset_rows(
+            self.state,
+            indices,
+            np.empty(0, np.uint64) if words is None else words,
+            landmarks,
+            task.grid.reachable,
+            task.grid.depot,
+            *self.sizes,
+        )
+        if task.needs_fields:
+            queue = np.empty(task.grid.n_cells, np.int32)
+            fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
+        self.limits[indices] = min(self.max_cycles if limit is None else limit, self.longest)
+        if self._trails is not None:
+            for index in indices:
+                self._trails[index].clear()
+            self.extend_trails(indices)
+
+    def find_bad_action(self, actions: NDArray[np.int64]) -> int:
+        """Return the position of the first action, shape (B, N), that is none, or -1.
+
+        If there is none, :meth:`step` will not look at the same array again.
+        """
+        position: int = find_bad_action(actions.reshape(-1).view(np.uint64), self.task.n_actions)
+        self._looked_at = actions if position < 0 else None
+        return position
+
+    def step(
+        self, actions: NDArray[np.int64], skip: NDArray[np.bool_]
+    ) -> tuple[
+        NDArray[np.float64],
+        NDArray[np.bool_],
+        NDArray[np.bool_],
+        NDArray[np.float32],
+        NDArray[np.int8],
+    ]:
+        """Carry out a valid joint action in each row but those to skip, and look at all.
+
+        Parameters
+        ----------
+        actions : ndarray of int64, shape (B, N)
+            One action an agent.
+        skip : ndarray of bool, shape (B,)
+            Rows that stay as they are; their reward is 0 and their flags are down.
+
+        Returns
+        -------
+        rewards, terminations, truncations : ndarray, shape (B,)
+            float64, bool, bool.
+        views, masks : ndarray of float32, shape (B, V, F), and of int8, shape (B, N, A)
+            Fresh observations, flat, and action masks.
+
+        Raises
+        ------
+        ValueError
+            If an action is not valid; nothing has moved then. The rules index a table with actions:
+            what no face has stopped would leave its memory.
+        """
+        if actions is not self._looked_at and (
+            actions.shape != (self.n_rows, self.task.n_agents) or self.find_bad_action(actions) >= 0
+        ):
+            raise ValueError(
+                f"actions must be in 0..{self.task.n_actions - 1}, one for each of "
+                f"{self.task.n_agents} agents in each of {self.n_rows} rows"
+            )
+        self._looked_at = None
+        rewards = np.empty(self.n_rows)
+        terminations = np.empty(self.n_rows, np.bool_)
+        truncations = np.empty(self.n_rows, np.bool_)
+        views = np.empty((self.n_rows, *self.views_shape), np.float32)
+        masks = np.empty((self.n_rows, *self.masks_shape), np.int8)
+        step_rows(
+            self.state,
+            actions,
+            skip,
+            self.limits,
+            *self.sizes,
+            self.reward,
+            self.kind,
+            *self.tables,
+            rewards,
+            terminations,
+            truncations,
+            views,
+            masks,
+        )
+        if self._trails is not None:
+            self.extend_trails(np.flatnonzero(~skip))
+        return rewards, terminations, truncations, views, masks
+
+    def observe(
+        self, indices: NDArray[np.int64] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Return fresh views, shape (M, V, F), and masks, shape (M, N, A), of some or all rows."""
+        indices = self._every_row if indices is None else indices
+        views = np.empty((len(indices), *self.views_shape), np.float32)
+        masks = np.empty((len(indices), *self.masks_shape), np.int8)
+        observe_rows(
+            self.state,
+            indices,
+            *self.sizes,
+            self.kind,
+            self.tables[0],
+            *self.tables[3:],
+            views,
+            masks,
+        )
+        return views, masks
+
+    def measure(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return cover time, makespan and total distance (R8), inf if unsolved, shape (M, 3)."""
+        costs = np.empty((len(indices), 3))
+        measure_rows(self.state, indices, *self.sizes, self.task.table, costs)
+        return costs
+
+    def extend_trails(self, indices: NDArray[np.int64]) -> None:
+        """Note where the agents of some rows are, for pictures; nothing without a render mode."""
+        if self._trails is not None:
+            for index in indices:
+                cells = self.state[index, : self.task.n_agents].tolist()
+                self._trails[index].append(tuple(cells))
+
+    def scene(self, index: int) -> Scene:
+        """Return what a picture of a row shows."""
+        task = self.task
+        row = self.state[index].tolist()
+        visited = task.n_agents + task.n_landmarks
+        cells = tuple(row[: task.n_agents])
+        trail = [cells] if self._trails is None else self._trails[index]
+        return Scene(
+            grid=task.grid,
+            landmarks=tuple(row[task.n_agents : visited]),
+            visited=tuple(bool(flag) for flag in row[visited : task.state_length]),
+            cells=cells,
+            trails=tuple(zip(*trail, strict=True)),
+            step=row[task.state_length],
+            max_cycles=int(self.limits[index]),
+        )

@@ -1,0 +1,144 @@
+"""One problem at a time: the state behind the scalar faces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.engine.loops import step_and_observe
+from mapp_env.engine.rows import Rows
+from mapp_env.engine.scene import Scene
+from mapp_env.engine.task import Task
+from mapp_env.problem import Problem
+
+__all__ = ["Simulation", "metrics_of"]
+
+FIRST_ROW = np.zeros(1, np.int64)
+
+
+class Simulation:
+    """A single row, from reset to the end of its episode.
+
+    Parameters
+    ----------
+    task : Task
+        What is simulated.
+    n_views : int
+        Observations V a step: the number of agents, or 1 for the global one once.
+
+    Attributes
+    ----------
+    max_cycles : int
+        Step limit of the episodes to come that do not bring their own.
+    running : bool
+        Whether :meth:`step` may be called.
+    """
+
+    def __init__(self, task: Task, n_views: int) -> None:
+        self.task = task
+        self.max_cycles = task.max_cycles
+        self.running = False
+        rows = Rows(task, 1, n_views)
+        self._rows = rows
+        self._limit = task.max_cycles
+        self._bind()
+        self._views_shape = rows.views_shape
+        self._masks_shape = rows.masks_shape
+        self._shape = (n_views, *task.view.shape)
+        self._records = task.render_mode is not None
+
+    def _bind(self) -> None:
+        """Gather what the kernel of a step takes; looking it up would take longer than the step."""
+        rows = self._rows
+        self._row = rows.state[0]
+        self._rules = (*rows.sizes, rows.reward, rows.kind, *rows.tables)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy; the row must be a view of the copied state, not a copy of the view."""
+        self.__dict__.update(state)
+        self._bind()
+
+    def reset(self, problem: Problem | None, np_random: np.random.Generator) -> None:
+        """Start an episode on ``problem``, or on one drawn with a single word of ``np_random``."""
+        self._limit = self.max_cycles
+        if problem is None:
+            words = np_random.integers(2**64, size=1, dtype=np.uint64)
+            self._rows.start(FIRST_ROW, words, limit=self._limit)
+        else:
+            if problem.max_cycles is not None:
+                self._limit = problem.max_cycles
+            landmarks = np.array([problem.landmarks], np.int32)
+            self._rows.start(FIRST_ROW, None, landmarks, self._limit)
+        self.running = True
+
+    def step(
+        self, actions: NDArray[np.int64]
+    ) -> tuple[float, bool, bool, NDArray[np.float32], NDArray[np.int8]]:
+        """Carry out a valid joint action.
+
+        Parameters
+        ----------
+        actions : ndarray of int64, shape (N,)
+            One action an agent.
+
+        Returns
+        -------
+        reward, terminated, truncated : float, bool, bool
+            Of the team (R6, R7).
+        views, masks : ndarray of float32, shape (V, ...), and of int8, shape (N, A)
+            Fresh observations and action masks.
+
+        Raises
+        ------
+        ValueError
+            If an action is not valid; nothing has moved then.
+        """
+        views = np.empty(self._views_shape, np.float32)
+        masks = np.empty(self._masks_shape, np.int8)
+        reward, terminated, truncated = step_and_observe(
+            self._row, actions, self._limit, *self._rules, views, masks
+        )
+        if terminated or truncated:
+            self.running = False
+        if self._records:
+            self._rows.extend_trails(FIRST_ROW)
+        if len(self._shape) > 2:
+            views = views.reshape(self._shape)
+        return reward, terminated, truncated, views, masks
+
+    def observe(self) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Return fresh observations, shape (V, ...), and action masks, shape (N, A)."""
+        views, masks = self._rows.observe()
+        return views.reshape(self._shape), masks[0]
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the global observation (R9), shape (N + 2K,)."""
+        state: NDArray[np.float32] = self._row[: self.task.state_length].astype(np.float32)
+        return state
+
+    def metrics(self) -> dict[str, bool | float]:
+        """Return success and the three costs of the episode (R8), inf if it was not solved."""
+        return metrics_of(self._rows.measure(FIRST_ROW)[0])
+
+    def scene(self) -> Scene:
+        """Return what a picture of this moment shows."""
+        return self._rows.scene(0)
+
+
+def metrics_of(costs: NDArray[np.float64]) -> dict[str, bool | float]:
+    """Return the metrics of an episode by name.
+
+    Parameters
+    ----------
+    costs : ndarray of float64, shape (3,)
+        Cover time, makespan and total distance, inf if not every landmark was visited.
+    """
+    cover_time, makespan, total_distance = costs.tolist()
+    return {
+        "success": cover_time != np.inf,
+        "cover_time": cover_time,
+        "makespan": makespan,
+        "total_distance": total_distance,
+    }

@@ -1,0 +1,255 @@
+"""A task: everything an environment is told when it is made, validated, and the tables it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.engine.observation import Observation, View, view
+from mapp_env.engine.rules import (
+    ALL_PAIRS,
+    BY_COORDINATES,
+    MAX_TABLE_CELLS,
+    N_ACTIONS,
+    NO_DISTANCES,
+    Reward,
+    cell_table,
+    manhattan_table,
+)
+from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
+from mapp_env.problem import (
+    MAX_AGENTS,
+    MAX_CYCLES,
+    MAX_LANDMARKS,
+    Problem,
+    check_grid,
+    check_landmarks,
+)
+from mapp_env.validation import check_choice, check_count, check_flag, describe
+
+__all__ = ["RENDER_MODES", "Task"]
+
+RENDER_MODES = ("human", "rgb_array", "ansi")
+
+MAX_BYTES = 1 << 30
+"""Largest array of one kind (observations, distance fields) that an environment may need."""
+
+
+Distances = tuple[NDArray[np.int32], int]
+"""What the kernels take for ``distances``, shape (S, C), and ``first_field``."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an environment is made of; all faces take these arguments and mean the same by them.
+
+    Parameters
+    ----------
+    grid : Grid
+        The grid; :func:`mapp_env.grids.find_grid` finds one by name or path.
+    n_agents : int
+        1 to 16.
+    n_landmarks : int
+        1 to 256, and no more than cells that can be reached.
+    max_cycles : int
+        Step at which an episode is truncated (R7), 1 to 1,000,000.
+    reward : {"manhattan", "geodesic", "step"}
+        The team reward (R6).
+    observation : {"global", "own_first", "planes", "geodesic"}
+        The observation kind (see :mod:`mapp_env.engine.observation`).
+    allow_wait : bool
+        Whether there is a fifth action, to wait (R3).
+    render_mode : {None, "human", "rgb_array", "ansi"}
+        How ``render()`` shows an episode.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid, or what they ask for together would not fit in memory.
+    """
+
+    grid: Grid
+    n_agents: int = 3
+    n_landmarks: int = 5
+    max_cycles: int = 50
+    reward: str = "manhattan"
+    observation: str = "global"
+    allow_wait: bool = False
+    render_mode: str | None = None
+
+    def __post_init__(self) -> None:
+        values = {
+            "n_agents": check_count("n_agents", self.n_agents, 1, MAX_AGENTS),
+            "n_landmarks": check_count("n_landmarks", self.n_landmarks, 1, MAX_LANDMARKS),
+            "max_cycles": check_count("max_cycles", self.max_cycles, 1, MAX_CYCLES),
+            "reward": check_choice("reward", self.reward, _names(Reward)),
+            "observation": check_choice("observation", self.observation, _names(Observation)),
+            "allow_wait": check_flag("allow_wait", self.allow_wait),
+            "render_mode": check_choice("render_mode", self.render_mode, (None, *RENDER_MODES)),
+        }
+        check_grid("grid", self.grid)
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        room = self.grid.reachable.size
+        if self.n_landmarks > room:
+            raise ValueError(
+                f"n_landmarks must be at most {room}, the cells of {self.grid!r} that can be "
+                f"reached from its depot; got {self.n_landmarks}"
+            )
+        self.check_memory(1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy the arguments alone: copies of the read-only tables would not be read-only."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a copy."""
+        for name, value in state.items():
+            object.__setattr__(self, name, value)
+
+    # -- what follows from the arguments -----------------------------------------------
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions an agent has: 4, or 5 with waiting."""
+        return N_ACTIONS + self.allow_wait
+
+    @property
+    def state_length(self) -> int:
+        """Number of entries of the global observation, N + 2K (R9)."""
+        return self.n_agents + 2 * self.n_landmarks
+
+    @property
+    def reward_kind(self) -> Reward:
+        """The reward as the kernels know it."""
+        return Reward[self.reward.upper()]
+
+    @property
+    def observation_kind(self) -> Observation:
+        """The observation as the kernels know it."""
+        return Observation[self.observation.upper()]
+
+    @cached_property
+    def view(self) -> View:
+        """Shape and bounds of one agent's observation."""
+        return view(self.observation_kind, self.grid, self.n_agents, self.n_landmarks)
+
+    @cached_property
+    def state_view(self) -> View:
+        """Shape and bounds of the global observation."""
+        return view(Observation.GLOBAL, self.grid, self.n_agents, self.n_landmarks)
+
+    @cached_property
+    def central_view(self) -> View:
+        """Shape and bounds of what the meta-agent sees: every agent's view, or the global one."""
+        one = self.view
+        if self.observation_kind == Observation.GLOBAL:
+            return one
+        low, high = (np.repeat(bound[None], self.n_agents, axis=0) for bound in (one.low, one.high))
+        return View((self.n_agents, *one.shape), low, high)
+
+    @cached_property
+    def table(self) -> NDArray[np.int32]:
+        """The grid as the kernels read it, shape (C, 9) int32."""
+        return cell_table(self.grid)
+
+    @property
+    def needs_fields(self) -> bool:
+        """Whether paths are kept for each landmark, the grid being too large for all pairs."""
+        wanted = "geodesic" in (self.reward, self.observation)
+        return wanted and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
+
+    def reward_distances(self, lines: NDArray[np.int32]) -> Distances:
+        """Return the distances that the reward looks up."""
+        if self.reward == "geodesic":
+            return self._paths(lines)
+        if self.grid.n_cells <= MAX_TABLE_CELLS:
+            return manhattan_table(self.grid), ALL_PAIRS
+        return NO_DISTANCES, BY_COORDINATES
+
+    def view_distances(self, lines: NDArray[np.int32]) -> Distances:
+        """Return the distances that the observation looks up."""
+        return self._paths(lines) if self.observation == "geodesic" else (NO_DISTANCES, ALL_PAIRS)
+
+    def _paths(self, lines: NDArray[np.int32]) -> Distances:
+        if not self.needs_fields:
+            return self.grid.distances, ALL_PAIRS
+        seen = lines.view()
+        seen.flags.writeable = False
+        return seen, 0
+
+    def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
+        """Refuse a number of rows whose arrays would not fit in memory.
+
+        Raises
+        ------
+        ValueError
+            If the observations or the joint actions' masks of one step, or the distance fields,
+            take more than 1 GiB.
+        """
+        views = 1 if self.observation_kind == Observation.GLOBAL else self.n_agents
+        size = 4 * n_rows * views * int(np.prod(self.view.shape))
+        if size > MAX_BYTES:
+            raise ValueError(
+                f"observation={self.observation!r} of {n_rows} environment(s) with {self.n_agents} "
+                f"agents on {self.grid!r} would take {size} bytes a step, allowed are {MAX_BYTES}"
+            )
+        if n_rows * n_joint_actions > MAX_BYTES:
+            raise ValueError(
+                f"central_action: masks of {n_joint_actions} joint actions of {n_rows} rows "
+                f"would take {n_rows * n_joint_actions} bytes a step, allowed are {MAX_BYTES}: "
+                "use 'multi'"
+            )
+        size = 4 * n_rows * self.n_landmarks * self.grid.n_cells
+        if self.needs_fields and size > MAX_BYTES:
+            raise ValueError(
+                f"geodesic distances of {n_rows} environment(s) with {self.n_landmarks} landmarks "
+                f"on {self.grid!r} would take {size} bytes, allowed are {MAX_BYTES}"
+            )
+
+    # -- what a reset may ask for ------------------------------------------------------
+
+    def check_options(self, options: Mapping[str, Any] | None) -> Problem | None:
+        """Return the problem that ``reset(options=...)`` asks for, or ``None`` for a random one.
+
+        ``"landmarks"`` holds cells or (row, col) pairs, ``"problem"`` a whole problem on this grid
+        with as many agents and landmarks. Other keys are ignored.
+
+        Raises
+        ------
+        ValueError
+            If the wish cannot be met.
+        """
+        if options is None:
+            return None
+        if not isinstance(options, Mapping):
+            raise ValueError(f"options must be a dict or None, got {describe(options)}")
+        problem, landmarks = options.get("problem"), options.get("landmarks")
+        if problem is None and landmarks is None:
+            return None
+        if problem is None:
+            cells = check_landmarks(self.grid, landmarks, self.n_landmarks, "options['landmarks']")
+            return Problem(self.grid, cells, self.n_agents)
+        if landmarks is not None:
+            raise ValueError("options must hold 'problem' or 'landmarks', got both")
+        if not isinstance(problem, Problem):
+            raise ValueError(
+                f"options['problem'] must be a mapp_env.Problem, got {describe(problem)}"
+            )
+        wanted = (problem.grid, problem.n_agents, len(problem.landmarks))
+        if wanted != (self.grid, self.n_agents, self.n_landmarks):
+            raise ValueError(
+                f"options['problem'] must be on this environment's {self.grid!r} with "
+                f"{self.n_agents} agents and {self.n_landmarks} landmarks; got one on "
+                f"{problem.grid!r} with {problem.n_agents} and {len(problem.landmarks)}"
+            )
+        return problem
+
+
+def _names(kinds: type[Reward] | type[Observation]) -> tuple[str, ...]:
+    return tuple(kind.name.lower() for kind in kinds)

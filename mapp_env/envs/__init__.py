@@ -1,0 +1,1 @@
+"""The faces: dictionaries and spaces on one side, arrays on the other."""

@@ -1,0 +1,228 @@
+"""The Gymnasium face of the meta-agent: one learner sees everything and commands every agent."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from numpy.typing import NDArray
+
+from mapp_env.engine.loops import fill_joint_mask, fill_joint_masks
+from mapp_env.engine.observation import Observation
+from mapp_env.engine.task import Task
+from mapp_env.envs.gymnasium_env import SimulationEnv
+from mapp_env.grid import Grid
+from mapp_env.grids import find_grid
+from mapp_env.validation import as_integer, check_choice, describe
+
+__all__ = [
+    "CENTRAL_ACTIONS",
+    "MAX_JOINT_AGENTS",
+    "CentralEnv",
+    "central_action_masks",
+    "central_action_space",
+]
+
+CENTRAL_ACTIONS = ("auto", "joint", "multi")
+
+MAX_JOINT_AGENTS = 6
+"""Largest team whose joint actions are numbered one by one (4**6 = 4096)."""
+
+
+def central_action_space(
+    task: Task, central_action: str
+) -> tuple[Discrete[np.int64] | MultiDiscrete, NDArray[np.int64] | None]:
+    """Return the meta-agent's action space and, for numbered joint actions, their table.
+
+    Parameters
+    ----------
+    task : Task
+        What is simulated.
+    central_action : {"auto", "joint", "multi"}
+        ``"joint"`` numbers the joint actions, the first agent most significant; ``"multi"`` takes
+        one action an agent; ``"auto"`` is joint up to six agents.
+
+    Returns
+    -------
+    Discrete or MultiDiscrete, and ndarray of int64, shape (A**N, N), or None
+        The space; the table holds each agent's action for each joint action.
+
+    Raises
+    ------
+    ValueError
+        If joint actions are asked for more than six agents.
+    """
+    check_choice("central_action", central_action, CENTRAL_ACTIONS)
+    n_agents, n_actions = task.n_agents, task.n_actions
+    if central_action == "joint" and n_agents > MAX_JOINT_AGENTS:
+        raise ValueError(
+            f"central_action='joint' is for at most {MAX_JOINT_AGENTS} agents, got n_agents="
+            f"{n_agents}: use 'multi'"
+        )
+    if central_action == "multi" or n_agents > MAX_JOINT_AGENTS:
+        return MultiDiscrete(np.full(n_agents, n_actions)), None
+    table = np.indices((n_actions,) * n_agents).reshape(n_agents, -1).T
+    return Discrete(n_actions**n_agents), np.ascontiguousarray(table, np.int64)
+
+
+def central_action_masks(
+    masks: NDArray[np.int8], joint_actions: NDArray[np.int64] | None
+) -> NDArray[np.bool_]:
+    """Return which of the meta-agent's actions bump no agent.
+
+    Parameters
+    ----------
+    masks : ndarray of int8, shape (B, N, A)
+        The agents' action masks.
+    joint_actions : ndarray of int64, shape (A**N, N), or None
+        What :func:`central_action_space` returns.
+
+    Returns
+    -------
+    ndarray of bool, shape (B, A**N) or, without numbered joint actions, (B, N * A)
+        Of every joint action, or of each agent's actions one agent after the other.
+    """
+    if joint_actions is None:
+        return masks.astype(np.bool_).reshape(len(masks), -1)
+    joint = np.empty((len(masks), len(joint_actions)), np.int8)
+    fill_joint_masks(masks, joint)
+    return joint.view(np.bool_)
+
+
+class CentralEnv(SimulationEnv):
+    """The problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
+
+    It sees what all agents see: the global observation once, or for the other kinds the agents'
+    observations stacked, shape (N, ...). ``info["action_mask"]`` is int8, shape (N, A): 0 for a
+    move that would bump; with numbered joint actions ``info["joint_action_mask"]``, shape (A**N,),
+    is 0 for those in which an agent would. On the last step ``info["metrics"]`` holds success,
+    cover_time, makespan and total_distance.
+
+    To draw an action that bumps nobody: ``action_space.sample(info["joint_action_mask"])``, or with
+    ``MultiDiscrete`` actions ``action_space.sample(tuple(info["action_mask"]))``.
+
+    Parameters
+    ----------
+    central_action : {"auto", "joint", "multi"}
+        ``"joint"``: ``Discrete(A**N)``, the first agent most significant; ``"multi"``:
+        ``MultiDiscrete``, one action an agent; ``"auto"``: joint up to six agents.
+    grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
+        As in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
+    """
+
+    def __init__(
+        self,
+        grid: str | os.PathLike[str] | Grid = "paper-7x7",
+        n_agents: int = 3,
+        n_landmarks: int = 5,
+        max_cycles: int = 50,
+        reward: str = "manhattan",
+        observation: str = "global",
+        allow_wait: bool = False,
+        render_mode: str | None = None,
+        central_action: str = "auto",
+    ) -> None:
+        task = Task(
+            find_grid(grid),
+            n_agents,
+            n_landmarks,
+            max_cycles,
+            reward,
+            observation,
+            allow_wait,
+            render_mode,
+        )
+        self._once = task.observation_kind == Observation.GLOBAL
+        super().__init__(task, 1 if self._once else task.n_agents)
+        view = task.central_view
+        self.observation_space = Box(view.low, view.high, dtype=np.float32)
+        self.action_space, self._joint_actions = central_action_space(task, central_action)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; ``options`` as in the PettingZoo face.
+
+        Raises
+        ------
+        ValueError
+            If seed or options cannot be used.
+        """
+        views, masks = self._start(seed, options)
+        return self._seen(views), self._find_info(masks)
+
+    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Carry out a joint action.
+
+        Raises
+        ------
+        ValueError
+            If it is not in the action space; nothing has moved then.
+        gymnasium.error.ResetNeeded
+            If there is no episode to step.
+        """
+        reward, terminated, truncated, views, masks = self._play(action)
+        info = self._find_info(masks)
+        if terminated or truncated:
+            info["metrics"] = self._simulation.metrics()
+        return self._seen(views), reward, terminated, truncated, info
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns
+        -------
+        ndarray of bool, shape (A**N,) or, with ``MultiDiscrete`` actions, (N * A,)
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("action_masks() needs an episode: call reset() first")
+        _, masks = self._simulation.observe()
+        found: NDArray[np.bool_] = central_action_masks(masks[None], self._joint_actions)[0]
+        return found
+
+    def _find_info(self, masks: NDArray[np.int8]) -> dict[str, Any]:
+        """Return the info of a moment in which the agents have these masks, shape (N, A)."""
+        if self._joint_actions is None:
+            return {"action_mask": masks}
+        joint = np.empty(len(self._joint_actions), np.int8)
+        fill_joint_mask(masks, joint)
+        return {"action_mask": masks, "joint_action_mask": joint}
+
+    def _read_action(self, action: Any) -> NDArray[np.int64]:
+        """Return each agent's action, shape (N,)."""
+        if self._joint_actions is not None:
+            number = as_integer(action)
+            if number is None or not 0 <= number < len(self._joint_actions):
+                raise ValueError(
+                    f"action must be an integer in 0..{len(self._joint_actions) - 1}, "
+                    f"got {describe(action)}"
+                )
+            joint: NDArray[np.int64] = self._joint_actions[number]
+            return joint
+        task = self.task
+        numbers = [as_integer(one) for one in action] if np.ndim(action) == 1 else []
+        if len(numbers) != task.n_agents or not all(
+            number is not None and 0 <= number < task.n_actions for number in numbers
+        ):
+            raise ValueError(
+                f"action must hold {task.n_agents} integers in 0..{task.n_actions - 1}, one an "
+                f"agent, got {describe(action)}"
+            )
+        return np.array(numbers, np.int64)
+
+    def _seen(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what the meta-agent sees of the agents' views, shape (V, ...)."""
+        return views[0] if self._once else views

@@ -1,0 +1,141 @@
+"""The agents side by side in tuples: the Gymnasium form that EPyMARL-style trainers take."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mapp_env.engine.task import Task
+from mapp_env.envs.gymnasium_env import SimulationEnv
+from mapp_env.grid import Grid
+from mapp_env.grids import find_grid
+from mapp_env.validation import as_integer, describe
+
+__all__ = ["TupleEnv"]
+
+Views = tuple[NDArray[np.float32], ...]
+
+
+class TupleEnv(SimulationEnv):
+    """The problem for independent or factored learners, registered as ``mapp_env/Tuple-v0``.
+
+    Observations and actions are tuples with an entry an agent, rewards a list with the team reward
+    for each, that of the last step included; ``terminated`` and ``truncated`` are of the team.
+    Infos are empty but for the last step's: such trainers sum what they find there, so it holds
+    one number, ``success`` (0 or 1). Masks, costs and the state are attributes.
+
+    Parameters
+    ----------
+    grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
+        As in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
+
+    Attributes
+    ----------
+    n_agents : int
+        Agents N.
+    action_masks : ndarray of int8, shape (N, A)
+        Of the present moment: 0 for a move that would bump.
+
+    Raises
+    ------
+    ValueError
+        If an argument is invalid.
+    """
+
+    def __init__(
+        self,
+        grid: str | os.PathLike[str] | Grid = "paper-7x7",
+        n_agents: int = 3,
+        n_landmarks: int = 5,
+        max_cycles: int = 50,
+        reward: str = "manhattan",
+        observation: str = "own_first",
+        allow_wait: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        task = Task(
+            find_grid(grid),
+            n_agents,
+            n_landmarks,
+            max_cycles,
+            reward,
+            observation,
+            allow_wait,
+            render_mode,
+        )
+        super().__init__(task, task.n_agents)
+        self.n_agents = task.n_agents
+        seen = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
+        self.observation_space = spaces.Tuple([seen] * task.n_agents)
+        self.action_space = spaces.Tuple(
+            [spaces.Discrete(task.n_actions) for _ in range(task.n_agents)]
+        )
+        self.action_masks = np.zeros((task.n_agents, task.n_actions), np.int8)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Views, dict[str, Any]]:
+        """Start an episode; ``options`` as in the PettingZoo face.
+
+        Raises
+        ------
+        ValueError
+            If seed or options cannot be used.
+        """
+        views, self.action_masks = self._start(seed, options)
+        return tuple(views), {}
+
+    def step(self, action: Sequence[int]) -> tuple[Views, list[float], bool, bool, dict[str, Any]]:  # type: ignore[override]
+        """Move all agents at the same instant.
+
+        Parameters
+        ----------
+        action : sequence of int, length N
+            An action for each agent.
+
+        Returns
+        -------
+        observations, rewards, terminated, truncated, info
+            A tuple of arrays and a list of floats, length N; flags of the team.
+
+        Raises
+        ------
+        ValueError
+            If an action is missing or not an action; nothing has moved then.
+        gymnasium.error.ResetNeeded
+            If there is no episode to step.
+        """
+        reward, terminated, truncated, views, self.action_masks = self._play(action)
+        info = {"success": float(terminated)} if terminated or truncated else {}
+        return tuple(views), [reward] * self.n_agents, terminated, truncated, info
+
+    def _read_action(self, action: Any) -> NDArray[np.int64]:
+        """Return each agent's action, shape (N,)."""
+        highest = self.task.n_actions - 1
+        numbers = [as_integer(one) for one in action] if isinstance(action, Sequence) else []
+        if isinstance(action, np.ndarray) and action.ndim == 1:
+            numbers = [as_integer(one) for one in action]
+        if len(numbers) != self.n_agents or not all(
+            number is not None and 0 <= number <= highest for number in numbers
+        ):
+            raise ValueError(
+                f"action must hold {self.n_agents} integers in 0..{highest}, one an agent, "
+                f"got {describe(action)}"
+            )
+        return np.array(numbers, np.int64)
+
+    def state(self) -> NDArray[np.float32]:
+        """Return the global observation (R9), shape (N + 2K,) float32, whatever agents see."""
+        return self._simulation.state()
+
+    def metrics(self) -> dict[str, bool | float]:
+        """Return success, cover_time, makespan and total_distance of the episode so far.
+
+        The costs are inf as long as a landmark is unvisited.
+        """
+        return self._simulation.metrics()

@@ -1,0 +1,1 @@
+"""What came out: plans, how they are replayed, and the tours in them."""

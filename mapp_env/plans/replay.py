@@ -1,0 +1,164 @@
+"""What the rules make of a list of joint actions: tours, claims and costs."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.compiled import kernel
+from mapp_env.engine.rules import (
+    BY_COORDINATES,
+    NO_DISTANCES,
+    WAIT,
+    Reward,
+    cell_table,
+    measure_row,
+    reset_row,
+    row_length,
+    step_row,
+)
+from mapp_env.grid import Grid
+from mapp_env.problem import Problem
+from mapp_env.validation import describe
+
+__all__ = ["Played", "check_joint_actions", "play"]
+
+
+class Played(NamedTuple):
+    """An episode; :class:`~mapp_env.plans.plan.Plan` says what its fields are."""
+
+    tours: tuple[tuple[int, ...], ...]
+    claims: tuple[tuple[int, ...], ...]
+    claim_steps: tuple[tuple[int, ...], ...]
+    actions: tuple[tuple[int, ...], ...]
+    cover_time: float
+    makespan: float
+    total_distance: float
+
+
+def play(problem: Problem, actions: NDArray[np.int64]) -> Played:
+    """Carry out joint actions until every landmark is visited or the problem's step limit.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is played; without a step limit all joint actions may be carried out.
+    actions : ndarray of int64, shape (T, N)
+        From :func:`check_joint_actions`.
+    """
+    actions = actions[: problem.max_cycles]
+    n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
+    table = cell_table(problem.grid)
+    row = np.empty(row_length(n_agents, n_landmarks), np.int32)
+    landmarks = np.array(problem.landmarks, np.int32)
+    reset_row(row, landmarks, problem.grid.depot, n_agents, n_landmarks)
+    cells = np.full((len(actions) + 1, n_agents), problem.grid.depot, np.int32)
+    visits = np.zeros(n_landmarks, np.int64)
+    steps = play_row(
+        row, actions, n_agents, n_landmarks, table, NO_DISTANCES, len(actions), cells, visits
+    )
+    claims: list[list[int]] = [[] for _ in range(n_agents)]
+    claim_steps: list[list[int]] = [[] for _ in range(n_agents)]
+    for landmark in np.argsort(visits, kind="stable"):
+        cell, step = problem.landmarks[landmark], int(visits[landmark])
+        if step > 0:
+            agent = int(np.argmax(cells[step] == cell))
+            claims[agent].append(cell)
+            claim_steps[agent].append(step)
+    costs = measure_row(row, n_agents, n_landmarks, table)
+    return Played(
+        tuple(
+            _tour(problem.grid, cells[:, agent], steps_of)
+            for agent, steps_of in enumerate(claim_steps)
+        ),
+        tuple(map(tuple, claims)),
+        tuple(map(tuple, claim_steps)),
+        tuple(map(tuple, actions[:steps].tolist())),
+        *(int(cost) if cost < math.inf else math.inf for cost in costs),
+    )
+
+
+def _tour(grid: Grid, cells: NDArray[np.int32], claim_steps: list[int]) -> tuple[int, ...]:
+    """Return an agent's cells without pauses, cut at its last claim and closed (R8)."""
+    if not claim_steps:
+        return ()
+    cells = cells[: claim_steps[-1] + 1]
+    moved = np.append(True, cells[1:] != cells[:-1])
+    return (*cells[moved].tolist(), *grid.path(int(cells[-1]), grid.depot)[1:])
+
+
+@kernel
+def play_row(
+    row: NDArray[np.int32],
+    actions: NDArray[np.int64],
+    n_agents: int,
+    n_landmarks: int,
+    table: NDArray[np.int32],
+    distances: NDArray[np.int32],
+    max_cycles: int,
+    cells: NDArray[np.int32],
+    visits: NDArray[np.int64],
+) -> int:
+    """Step a row through joint actions, and return how many were carried out.
+
+    Parameters
+    ----------
+    row, actions, n_agents, n_landmarks, table, distances, max_cycles
+        As in :func:`~mapp_env.engine.rules.step_row`, but for all steps: actions are (T, N).
+    cells : ndarray of int32, shape (T + 1, N)
+        Where the agents are after each step.
+    visits : ndarray of int64, shape (K,)
+        Zero on entry; the step at which each landmark is visited.
+    """
+    visited = n_agents + n_landmarks
+    for step in range(1, actions.shape[0] + 1):
+        _, terminated, _ = step_row(
+            row,
+            actions[step - 1],
+            n_agents,
+            n_landmarks,
+            max_cycles,
+            Reward.STEP,
+            table,
+            distances,
+            BY_COORDINATES,
+        )
+        for agent in range(n_agents):
+            cells[step, agent] = row[agent]
+        for landmark in range(n_landmarks):
+            if row[visited + landmark] == 1 and visits[landmark] == 0:
+                visits[landmark] = step
+        if terminated:
+            return step
+    return len(actions)
+
+
+def check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]:
+    """Return joint actions as an int64 array of shape (T, N).
+
+    Raises
+    ------
+    ValueError
+        If the shape is wrong or an action is not one.
+    """
+    try:
+        array = np.asarray(joint_actions)
+    except (ValueError, RecursionError):
+        array = np.array(None)  # ragged, or nested too deep
+    if array.shape in ((0,), (0, n_agents)):
+        return np.empty((0, n_agents), np.int64)
+    if array.ndim != 2 or array.shape[1] != n_agents or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"joint_actions must be integers of shape (T, {n_agents}), "
+            f"got {describe(joint_actions)}"
+        )
+    wrong = np.argwhere((array < 0) | (array > WAIT))
+    if len(wrong):
+        step, agent = wrong[0].tolist()
+        raise ValueError(
+            f"joint_actions[{step}, {agent}] must be in 0..{WAIT}, got {array[step, agent]}"
+        )
+    return np.ascontiguousarray(array, np.int64)
