@@ -1,20 +1,20 @@
-"""Run compare.py's grid of presets, learners and seeds as Ray tasks, on one machine or on many.
+"""Run compare.py's grid of presets, learners and seeds as Ray tasks on one or more machines.
 
     pip install -c constraints.txt -e ".[baselines,ray]"
     python examples/ray_seeds.py --out runs/compare --seeds 5
     python examples/ray_seeds.py --address auto --out /shared/compare --seeds 5
 
-Every training is a Ray task with one core, in a process of its own. A worker that is lost (killed,
-out of memory, its machine gone) is started again by Ray, up to ``--max-retries`` times, and its
-training goes on from the last checkpoint in its run folder, to the same bytes as if nothing had
-been. (How often one that was out of memory is started again, a cluster decides where it is started:
-RAY_task_oom_retries, without end if it is not set.) OUT has to be a folder that all machines see
-under the same path, and so have this checkout and the working directory if an option names a file.
+Every training run is a Ray task with one core and its own process. Ray restarts a lost worker
+(killed, out of memory, its machine gone) up to ``--max-retries`` times, and the run continues from
+the last checkpoint in its run folder, to the same bytes as an uninterrupted run. (On a cluster, the
+limit for workers that ran out of memory is set where the cluster is started:
+RAY_task_oom_retries, unlimited by default.) OUT must be a folder that all machines see under the
+same path, and so must this checkout and, if an option names a file, the working directory.
 
-Output: OUT/comparison.md, .csv and .png as ``python baselines/compare.py`` writes them, equal but
-for the minutes, and the run folder and log of each training. The same command, or compare.py's,
-goes on where this one was stopped. Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings,
-each with a checkpoint.
+Output: OUT/comparison.md, .csv and .png as written by ``python baselines/compare.py``, identical
+except for the minutes, and the run folder and log of each run. The same command, or compare.py's,
+resumes a stopped study. Ctrl-C (exit code 130) and SIGTERM (143) stop all runs, each with a
+checkpoint.
 
 Without ``--address`` Ray is started here, on ``--jobs`` cores, and stopped at the end.
 """
@@ -44,19 +44,19 @@ from mapp_env.validation import check_count
 ROOT = Path(__file__).resolve().parents[1]
 OBJECT_STORE_BYTES = 200_000_000  # a task returns one number
 LEFT_SECONDS = 120.0
-"""A process that Ray has lost may train on for seconds, and a network file system keeps the lock of
-a lost machine until its lease has run out, after 90 s by default for NFS 4."""
+"""A process that Ray has lost may keep training for seconds, and a network file system holds a lost
+machine's lock until its lease expires, by default after 90 s for NFS 4."""
 
 
 @dataclass
 class Args(compare.Args):
-    """Options of a comparison, and where it runs; all others are handed to the trainings."""
+    """Options of a comparison, and where it runs; all others are passed to the training runs."""
 
     address: str | None = None
-    """of a Ray cluster ("auto": the one this machine belongs to); its cores are all used, whatever
-    jobs is; by default Ray is started here"""
+    """address of a Ray cluster ("auto": the one this machine belongs to), whose cores are all used,
+    regardless of jobs; by default Ray is started here"""
     max_retries: int = 3
-    """how often a training is taken up again whose worker was lost"""
+    """how often a run whose worker was lost is restarted"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -64,16 +64,16 @@ class Args(compare.Args):
 
 
 def train(trial: Trial, directory: Path) -> int:
-    """Train in this process, or go on with what a lost one has left; return the exit code.
+    """Train in this process, or resume the run of a lost one; return the exit code.
 
-    Files that options name are looked for from `directory`.
+    Paths in options are relative to `directory`.
 
     Raises
     ------
     ValueError
-        If the run folder holds anything else, or another process still trains in it.
+        If the run folder holds anything else, or another process is still training in it.
     """
-    # A line at a time: of a process that is killed nothing else is left.
+    # Line buffered: all that remains of a killed process.
     with (
         trial.log.open("a", buffering=1, encoding="utf-8") as log,
         contextlib.redirect_stdout(log),
@@ -119,12 +119,12 @@ def start_ray(address: str | None, jobs: int, max_retries: int) -> None:
 
 
 def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -> list[str]:
-    """Train what is not finished as Ray tasks; return what went wrong, a line for each."""
+    """Train unfinished runs as Ray tasks; return one line for each failure."""
     waiting = [trial for trial in trials if not trial.finished]
     done = len(trials) - len(waiting)
     if done:
         print(f"{done} of {len(trials)} trainings were finished already")
-    # One call a process: nothing is left over from the training before.
+    # One call per process: nothing is left over from the previous run.
     task = ray.remote(num_cpus=1, max_calls=1, max_retries=max_retries)(train)
     running = {task.remote(trial, Path.cwd()): trial for trial in waiting}
     failures: list[str] = []
@@ -133,7 +133,7 @@ def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -
         if signals.received is not None and not told:
             told = True
             for reference in running:
-                ray.cancel(reference)  # as Ctrl-C: the training saves a checkpoint and returns
+                ray.cancel(reference)  # like Ctrl-C: the run saves a checkpoint and returns
         for reference in ray.wait(list(running), timeout=0.5)[0]:
             trial = running.pop(reference)
             problem = describe_failure(reference, trial)
@@ -147,7 +147,7 @@ def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -
 
 
 def describe_failure(reference: "ray.ObjectRef[int]", trial: Trial) -> str | None:
-    """Return what went wrong with a task that has ended, None if nothing."""
+    """Return why a finished task failed, or None if it succeeded."""
     try:
         code = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
@@ -158,12 +158,12 @@ def describe_failure(reference: "ray.ObjectRef[int]", trial: Trial) -> str | Non
 
 
 def main(args: Args, words: Sequence[str] = ()) -> int:
-    """Train, compare, draw; return the exit code.
+    """Train, compare and draw; return the exit code.
 
     Raises
     ------
     ValueError
-        If an option is refused, or a training has failed.
+        If an option is refused, or a run has failed.
     """
     args.out = args.out.resolve()
     trials = compare.plan_trials(args, words)
