@@ -23,8 +23,8 @@ from mapp_env.commands.reports import (
     landmarks_line,
     print_report,
 )
-from mapp_env.files import labelled
 from mapp_env.plans.plan import OBJECTIVES, Plan
+from mapp_env.records import labelled
 from mapp_env.solvers import METHODS, solve
 
 __all__ = ["add_arguments", "run"]

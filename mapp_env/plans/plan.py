@@ -11,18 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.engine.rules import WAIT
-from mapp_env.files import (
-    MAX_INTEGER,
-    MAX_PLAN_BYTES,
-    FileError,
-    Record,
-    read_record,
-    write_record,
-)
+from mapp_env.files import FileError
 from mapp_env.plans.replay import Played, check_joint_actions, play
 from mapp_env.plans.tour_checks import check_claims, check_tours
 from mapp_env.plans.walking import moves_of, tour_of, walk_tours
 from mapp_env.problem import MAX_CYCLES, Problem
+from mapp_env.records import MAX_INTEGER, MAX_PLAN_BYTES, Record, read_record, write_record
 from mapp_env.validation import as_integer, as_real, check_choice, describe
 
 __all__ = ["OBJECTIVES", "STATUSES", "Plan", "replay"]
