@@ -11,7 +11,6 @@ It comes with the extra ``pyvrp`` and is imported when a problem is solved.
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -19,12 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.distances import landmark_distances
-from mapp_env.solvers.solution import Routes, Solution, solution_of
-from mapp_env.validation import check_choice
+from mapp_env.solvers.solution import (
+    UNBOUNDED,
+    Routes,
+    Solution,
+    landmark_distances,
+    solution_of,
+)
 
 __all__ = ["DEFAULT_SECONDS", "search_routes", "solve_pyvrp"]
 
@@ -35,8 +38,6 @@ DEFAULT_SECONDS = 2.0
 # with a tight limit no way through plans that break it.
 MAX_PENALTY = 100.0
 PENALTY_ROUNDS = 50
-
-FAR = 1 << 60
 
 
 def solve_pyvrp(
@@ -74,9 +75,8 @@ def solve_pyvrp(
     ValueError
         If ``objective`` is unknown.
     """
-    check_choice("objective", objective, OBJECTIVES)
-    _import_pyvrp()
-    deadline = time.perf_counter() + (DEFAULT_SECONDS if time_limit is None else time_limit)
+    import_pyvrp()
+    deadline = clock() + (DEFAULT_SECONDS if time_limit is None else time_limit)
     distances = landmark_distances(problem)
     bound = lower_bound(problem, objective, distances)
     cost, nodes = search_routes(
@@ -105,7 +105,7 @@ def search_routes(
     objective : {"cover_time", "makespan", "total_distance"}
         What is minimised.
     deadline : float
-        When to stop, on ``time.perf_counter()``'s clock.
+        When to stop, on ``clock()``'s clock.
     seed : int
         Of the search.
     bound : int
@@ -113,7 +113,7 @@ def search_routes(
     on_better : callable, optional
         Called with each smaller cost.
     """
-    pyvrp = _import_pyvrp()
+    pyvrp = import_pyvrp()
     arcs = distances.astype(np.int64)
     if objective == "cover_time":
         arcs[:, 0] = 0
@@ -121,7 +121,7 @@ def search_routes(
     penalty = pyvrp.PenaltyParams(max_penalty=MAX_PENALTY, solutions_between_updates=PENALTY_ROUNDS)
     params = pyvrp.SolveParams(penalty=penalty)
     total = objective == "total_distance"
-    best = FAR
+    best = UNBOUNDED
     routes: Routes = ()
     while True:
         limit = {}
@@ -138,7 +138,7 @@ def search_routes(
             duration_matrices=[np.zeros_like(arcs)],
         )
         # Where the longest route counts, any plan within the limit will do.
-        stop = _Stop(deadline, bound, on_better) if total else _Stop(deadline, FAR - 1, None)
+        stop = _Stop(deadline, bound, on_better) if total else _Stop(deadline, UNBOUNDED - 1, None)
         with warnings.catch_warnings():
             # It says that no plan is in sight, and that is how this ends.
             warnings.simplefilter("ignore", pyvrp.exceptions.PenaltyBoundWarning)
@@ -154,7 +154,7 @@ def search_routes(
         )
         if on_better is not None and not total:
             on_better(best)
-        if total or best <= bound or time.perf_counter() >= deadline:
+        if total or best <= bound or clock() >= deadline:
             break
     if not routes:
         raise RuntimeError("PyVRP found no plan, though nothing limits one")
@@ -162,7 +162,7 @@ def search_routes(
 
 
 class _Stop:
-    """Tells PyVRP when to stop: at a time, or at a cost (which is far above FAR for no plan).
+    """Tells PyVRP when to stop: at a time, or at a cost (which is far above any no plan).
 
     PyVRP asks in each iteration, so this is also who sees costs fall.
     """
@@ -171,17 +171,17 @@ class _Stop:
         self._deadline = deadline
         self._cost = cost
         self._on_better = on_better
-        self._best = FAR
+        self._best = UNBOUNDED
 
     def __call__(self, best_cost: float) -> bool:
         if best_cost < self._best:
             self._best = int(best_cost)
             if self._on_better is not None:
                 self._on_better(self._best)
-        return best_cost <= self._cost or time.perf_counter() >= self._deadline
+        return best_cost <= self._cost or clock() >= self._deadline
 
 
-def _import_pyvrp() -> Any:
+def import_pyvrp() -> Any:
     """Return the package, or say how to get it."""
     try:
         import pyvrp

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.solvers.solution import UNBOUNDED
 
 __all__ = ["Layout", "Scratch", "Team", "improve"]
 
@@ -33,7 +34,6 @@ LONGEST_PERCENT = 75
 MEAN_BLINK = 100  # places tried between two that are skipped
 
 LOW_32_BITS = 0xFFFFFFFF
-FAR = 1 << 60
 
 # Places in `Search.memory`.
 WORD, COST, BEST, BEST_TOTAL, DONE, IMPROVED, CYCLE_END, CYCLE = range(8)
@@ -224,7 +224,7 @@ def recreate(
     blink = 1 + draw(memory, 2 * MEAN_BLINK)
     for index in range(count):
         node = scratch.removed[index]
-        least = FAR
+        least = UNBOUNDED
         chosen = 0
         chosen_place = 0
         tried_empty = False
@@ -244,7 +244,7 @@ def recreate(
                 else:
                     detour += layout.back[node] - layout.back[before]
                 blink -= 1
-                if blink <= 0 and least < FAR:
+                if blink <= 0 and least < UNBOUNDED:
                     blink = 1 + draw(memory, 2 * MEAN_BLINK)
                     continue
                 excess = max(team.lengths[agent] + detour - top, 0)
