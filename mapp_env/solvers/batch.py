@@ -137,22 +137,10 @@ def solve_rows(
     optimum: NDArray[np.int32],
     workspace: Workspace,
 ) -> None:
-    """Fill in the optimum of each row.
+    """Fill in the ``optimum``, shape (p,), of each row of landmarks' nodes, shape (p, K).
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (S, S)
-        Between nodes; node 0 is the depot.
-    rows : ndarray of int32, shape (p, K)
-        The landmarks' nodes.
-    teams : int
-        Number of agents, at most K.
-    closed : bool
-        Whether tours are closed.
-    optimum : ndarray of int32, shape (p,)
-        The results.
-    workspace : Workspace
-        Of K landmarks.
+    ``distances``, shape (S, S), are between nodes; node 0 is the depot. ``teams``, at most K, and
+    ``closed`` are from :func:`~mapp_env.solvers.solution.team_of`.
     """
     between, routes, costs, worst = workspace
     n_landmarks = rows.shape[1]
@@ -171,14 +159,8 @@ def solve_rows(
 def least_worst(costs: NDArray[np.int32], teams: int, worst: NDArray[np.int32]) -> int:
     """Return the smallest possible cost of the costliest of so many sets that hold everything.
 
-    Parameters
-    ----------
-    costs : ndarray of int32, shape (2 ** K,)
-        What each set costs one agent.
-    teams : int
-        Number of agents.
-    worst : ndarray of int32, shape (2, 2 ** (K - 1))
-        Scratch space: the answer for fewer agents and each set without the highest landmark.
+    ``costs``, shape (2 ** K,), is what each set costs one agent; ``worst``, shape
+    (2, 2 ** (K - 1)), the answer for fewer agents and each set without the highest landmark.
     """
     half = worst.shape[1]
     if teams == 1:

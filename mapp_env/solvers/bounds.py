@@ -24,19 +24,14 @@ SCALE = 1 << 10
 
 
 def lower_bound(problem: Problem, objective: str, distances: NDArray[np.int32]) -> int:
-    """Return a cost that no plan of a problem can beat.
+    """Return a cost that no plan of a problem can beat; up to 12 landmarks it is the optimum.
 
-    It is the larger of :func:`tree_bound` and :func:`subset_bound`; up to 12 landmarks it is the
-    optimum.
+    ``distances`` are from :func:`~mapp_env.solvers.solution.landmark_distances`.
 
-    Parameters
-    ----------
-    problem : Problem
-        The problem.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is bounded.
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        From :func:`~mapp_env.solvers.solution.landmark_distances`.
+    Raises
+    ------
+    ValueError
+        If the objective is unknown.
     """
     check_choice("objective", objective, OBJECTIVES)
     teams, closed = team_of(objective, problem.n_agents, len(distances) - 1)
@@ -56,29 +51,12 @@ def tree_bound(distances: NDArray[np.int32], teams: int, closed: bool) -> int:
       the depot at most N, again under node penalties; one agent walks at least an N-th of it.
 
     Closed tours on a grid have even length, so their bounds are rounded up to even numbers.
-
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Between the depot (node 0) and the landmarks.
-    teams : int
-        Number of agents.
-    closed : bool
-        Whether the way home counts.
     """
     n_nodes = len(distances)
     farthest = int(distances[0].max()) * (2 if closed else 1)
     if n_nodes == 2:
         return farthest
-    scaled = ascend(
-        distances,
-        closed,
-        teams,
-        np.zeros(n_nodes, np.int64),
-        np.empty(n_nodes, np.int64),
-        np.empty(n_nodes, np.int64),
-        np.empty(n_nodes, np.int64),
-    )
+    scaled = ascend(distances, closed, teams, *np.zeros((4, n_nodes), np.int64))
     spread = -(-int(scaled) // (SCALE * teams))
     if closed:
         spread += spread % 2
@@ -91,17 +69,6 @@ def subset_bound(distances: NDArray[np.int32], teams: int, closed: bool, low: in
     With landmarks left out a plan is a plan still: no optimum falls with a landmark more. The
     farthest from the depot comes first, then always the one for which the distance to the nearest
     chosen landmark and the distance to the depot have the largest sum.
-
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Between the depot (node 0) and the landmarks.
-    teams : int
-        Number of agents.
-    closed : bool
-        Whether the way home counts.
-    low : int
-        A lower bound of the whole problem.
     """
     home = distances[0]
     nodes = [0, int(home.argmax())]
@@ -116,6 +83,10 @@ def subset_bound(distances: NDArray[np.int32], teams: int, closed: bool, low: in
 
 # -- spanning trees ------------------------------------------------------
 
+# An agent's route is a tree, and so are the routes of a team together: a smallest spanning tree is
+# never longer. Penalties on nodes, which change the trees but no tour, raise the bound (Held and
+# Karp 1970, doi:10.1287/opre.18.6.1138).
+
 
 @kernel
 def ascend(
@@ -127,7 +98,7 @@ def ascend(
     links: NDArray[np.int64],
     degrees: NDArray[np.int64],
 ) -> int:
-    """Raise node penalties by subgradient steps; return the best bound seen, times ``SCALE``.
+    """Raise node penalties by subgradient steps; return the best bound found, times ``SCALE``.
 
     Parameters
     ----------
@@ -138,10 +109,8 @@ def ascend(
         no degree above 2, the depot's not above ``n_agents``).
     n_agents : int
         Number of agents.
-    penalties : ndarray of int64, shape (n,)
-        Zero on entry.
-    reach, links, degrees : ndarray of int64, shape (n,)
-        Scratch space.
+    penalties, reach, links, degrees : ndarray of int64, shape (n,)
+        Zero on entry; the last three are scratch space.
     """
     n_nodes = distances.shape[0]
     best = 0

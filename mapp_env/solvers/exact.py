@@ -175,14 +175,8 @@ def sum_subsets(counts: NDArray[np.int64], sign: int) -> None:
 def _split(tours: NDArray[np.int32], families: Families, teams: int) -> list[int]:
     """Return disjoint sets, one an agent, that hold everything with the least sum of tours.
 
-    Parameters
-    ----------
-    tours : ndarray of int32, shape (2 ** K,)
-        What each set costs one agent, at least ``FAR`` if it cannot visit it.
-    families : Families
-        The sets that so many agents can visit.
-    teams : int
-        Number of agents; they can visit everything.
+    ``tours``, shape (2 ** K,), is what each set costs one agent, at least ``FAR`` if it cannot
+    visit it; ``teams`` agents can visit everything.
     """
     half = len(tours) // 2
     if teams > FEW_AGENTS:
@@ -223,18 +217,10 @@ def add_agent(
     wanted: NDArray[np.bool_],
     more: NDArray[np.int32],
 ) -> None:
-    """Fill in the least sums of tours for one agent more, ``FAR`` where not wanted.
+    """Fill in ``more``, the least sums of tours for one agent more, ``FAR`` where not wanted.
 
-    Parameters
-    ----------
-    tours : ndarray of int32, shape (2 ** K,)
-        What each set costs one agent.
-    sums : ndarray of int32, shape (2 ** (K - 1),)
-        The least sums so far. May be ``more``: then the agents are as many as it takes.
-    wanted : ndarray of bool, shape (2 ** (K - 1),)
-        Which sets matter.
-    more : ndarray of int32, shape (2 ** (K - 1),)
-        The result.
+    ``sums`` are those so far, shape (2 ** (K - 1),) like all but ``tours``. They may be ``more``
+    itself: then the agents are as many as it takes.
     """
     more[0] = 0
     top = 1

@@ -20,17 +20,7 @@ def route_tables(
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return, for each set, the steps to each of its landmarks as the last, and its cost.
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Symmetric; node 0 is the depot.
-    closed : bool
-        Whether the way back to the depot counts.
-
-    Returns
-    -------
-    routes, costs : ndarray of int32, shape (2 ** K, K) and (2 ** K,)
-        From :func:`shortest_routes` and :func:`route_costs`.
+    As :func:`shortest_routes` and :func:`route_costs` fill them in, (2 ** K, K) and (2 ** K,).
     """
     n_landmarks = len(distances) - 1
     routes = np.empty((1 << n_landmarks, n_landmarks), np.int32)

@@ -227,6 +227,7 @@ def recreate(
         least = UNBOUNDED
         chosen = 0
         chosen_place = 0
+        chosen_detour = 0
         tried_empty = False
         for agent in range(n_routes):
             size = team.sizes[agent]
@@ -253,20 +254,13 @@ def recreate(
                     least = cost
                     chosen = agent
                     chosen_place = place
+                    chosen_detour = detour
         route = team.routes[chosen]
-        size = team.sizes[chosen]
-        before = route[chosen_place - 1] if chosen_place > 0 else 0
-        detour = distances[node, before]
-        if chosen_place < size:
-            after = route[chosen_place]
-            detour += distances[node, after] - distances[before, after]
-        else:
-            detour += layout.back[node] - layout.back[before]
-        for place in range(size, chosen_place, -1):
+        for place in range(team.sizes[chosen], chosen_place, -1):
             route[place] = route[place - 1]
         route[chosen_place] = node
-        team.sizes[chosen] = size + 1
-        team.lengths[chosen] += detour
+        team.sizes[chosen] += 1
+        team.lengths[chosen] += chosen_detour
         top = max(top, team.lengths[chosen])
         scratch.holder[node] = chosen
         scratch.touched[chosen] = True

@@ -139,9 +139,14 @@ class Search:
             (np.argsort(distances[:, 1:], axis=1, kind="stable") + 1).astype(np.int32),
             0 if objective == "total_distance" else 2 * n_agents,
         )
-        self._now = _empty_team(n_routes, n_landmarks)
-        self._trial = _empty_team(n_routes, n_landmarks)
-        self._best = _empty_team(n_routes, n_landmarks)
+        self._teams = [
+            Team(
+                np.zeros((n_routes, n_landmarks), np.int32),
+                np.zeros(n_routes, np.int64),
+                np.zeros(n_routes, np.int64),
+            )
+            for _ in range(3)
+        ]
         self._scratch = Scratch(
             np.full(n_landmarks + 1, -1),
             np.zeros(n_landmarks, np.int64),
@@ -156,35 +161,15 @@ class Search:
         self._heat = np.array([COLD * leg, 1.0, HOT * leg, COLD * leg])
 
     def run(self, iterations: int, bound: int = -1) -> bool:
-        """Carry out some iterations.
+        """Carry out so many iterations at most; return whether more could do better.
 
-        Parameters
-        ----------
-        iterations : int
-            How many, at most.
-        bound : int
-            A cost that cannot be beaten: once it is reached, only the total distance is left to
-            improve.
-
-        Returns
-        -------
-        bool
-            Whether more iterations could do better: False once ``bound`` is reached and the total
-            distance has not fallen for a while.
+        ``bound`` is a cost that cannot be beaten: once it is reached, only the total distance is
+        left to improve, and no more is to be done when that has not fallen for a while.
         """
-        return bool(
-            improve(
-                iterations,
-                bound,
-                self._layout,
-                self._now,
-                self._trial,
-                self._best,
-                self._scratch,
-                self._memory,
-                self._heat,
-            )
+        going = improve(
+            iterations, bound, self._layout, *self._teams, self._scratch, self._memory, self._heat
         )
+        return bool(going)
 
     @property
     def cost(self) -> int:
@@ -198,15 +183,6 @@ class Search:
 
     def routes(self) -> Routes:
         """Return the best routes so far, as nodes 1 to K, for at most as many as agents."""
-        return tuple(
-            tuple(route[:size].tolist())
-            for route, size in zip(self._best.routes, self._best.sizes, strict=True)
-        )
-
-
-def _empty_team(n_routes: int, n_landmarks: int) -> Team:
-    return Team(
-        np.zeros((n_routes, n_landmarks), np.int32),
-        np.zeros(n_routes, np.int64),
-        np.zeros(n_routes, np.int64),
-    )
+        best = self._teams[-1]
+        pairs = zip(best.routes, best.sizes, strict=True)
+        return tuple(tuple(route[:size].tolist()) for route, size in pairs)

@@ -95,16 +95,9 @@ def solve_universe(
 
 @kernel
 def list_sets(chosen: NDArray[np.int64], n_items: int, sets: NDArray[np.int32]) -> None:
-    """Write sets of items in lexicographic order, from ``chosen`` on.
+    """Write sets of items, 0 to ``n_items - 1``, in lexicographic order: ``sets``, shape (p, K).
 
-    Parameters
-    ----------
-    chosen : ndarray of int64, shape (K,)
-        The first set, ascending; left as the one after the last, if there is one.
-    n_items : int
-        Items are 0 to ``n_items - 1``.
-    sets : ndarray of int32, shape (p, K)
-        The result.
+    ``chosen``, shape (K,), is the first, ascending; left as the one after the last, if any.
     """
     n_chosen = chosen.shape[0]
     last = n_items - n_chosen
