@@ -123,8 +123,7 @@ def distances_to(grid: Grid, landmarks: Sequence[int], reward: str) -> np.ndarra
     """Return what the reward calls a distance from each landmark to each cell: (K, C)."""
     if reward == "geodesic":
         return np.asarray(grid.distances_from(landmarks))
-    rows, cols = np.divmod(np.arange(grid.n_cells), grid.cols)
-    return np.array([abs(rows - rows[cell]) + abs(cols - cols[cell]) for cell in landmarks])
+    return np.asarray(grid.manhattan_from(landmarks))
 
 
 # -- the policy that is optimal for them -------------------------------------------------------

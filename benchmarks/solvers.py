@@ -28,12 +28,11 @@ import numpy as np
 
 from mapp_env import Problem, make_grid
 from mapp_env.plans.plan import OBJECTIVES
-from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
 from mapp_env.solvers.search import solve_search
-from mapp_env.solvers.solution import Solution
+from mapp_env.solvers.solution import Solution, landmark_distances
 
 SIZES = (  # side of the grid, landmarks, agents
     (7, 5, 3),

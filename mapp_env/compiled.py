@@ -6,6 +6,7 @@ import contextlib
 import glob
 import hashlib
 import os
+import time
 import warnings
 from collections.abc import Callable
 from importlib import resources
@@ -13,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from numba import config, njit
+from numba.core import event
 from numba.core.caching import FunctionCache
 
-__all__ = ["cache_files", "cache_folders", "is_compiled", "kernel", "nogil_kernel"]
+__all__ = ["cache_files", "cache_folders", "clock", "is_compiled", "kernel", "nogil_kernel"]
 
 
 def _digest_sources() -> str:
@@ -124,6 +126,18 @@ def _tell(reason: Exception) -> None:
             RuntimeWarning,
             stacklevel=2,
         )
+
+
+_COMPILING = event.TimingListener()  # type: ignore[no-untyped-call]
+event.register("numba:compiler_lock", _COMPILING)  # type: ignore[no-untyped-call]
+
+
+def clock() -> float:
+    """Return seconds, on a clock that stands still while kernels are compiled or loaded.
+
+    Solvers go by it: the first plan of an installation takes their time, not the compiler's.
+    """
+    return time.perf_counter() - (_COMPILING.duration if _COMPILING.done else 0.0)
 
 
 def is_compiled() -> bool:

@@ -1,8 +1,4 @@
-"""Files that strangers may have written: read with suspicion, written whole or not at all.
-
-A file holds one JSON object: ``format`` and ``version`` say what it is, every other field is
-required, none may be added. Numbers are finite, no key comes twice, ``true`` is no number.
-"""
+"""Files that strangers may have written: read with suspicion, written whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,44 +11,22 @@ import pathlib
 import re
 import secrets
 import stat
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 from mapp_env.validation import describe
 
 __all__ = [
-    "MAX_PLAN_BYTES",
-    "MAX_PROBLEM_BYTES",
     "FileError",
-    "Record",
     "check_writable",
-    "labelled",
     "make_folder",
+    "parse_json",
     "read_bytes",
-    "read_record",
+    "read_json",
     "remove_unfinished",
-    "unique_fields",
     "write_bytes",
-    "write_record",
     "write_text",
 ]
 
-VERSION = 1
-
-MAX_PROBLEM_BYTES = 1 << 20
-"""Largest problem file: the text of a 512 x 512 grid takes about a quarter of it."""
-
-MAX_PLAN_BYTES = 16 << 20
-"""Largest plan file: sixteen agents that act, and walk, for half a million steps each.
-
-On a 512 x 512 grid a shortest path, which leaves a third of the cells aside, and the way back take
-350,000.
-"""
-
-MAX_MARKS = 1_000
-"""Most brackets, colons and quotes in a file: a parser may need a second for millions of them."""
-
-MAX_INTEGER = 2**53 - 1  # what every reader of JSON keeps exactly
 MAX_PATH_LETTERS = 320  # of a path in a message
 MAX_LINKS = 40  # as Linux follows at most
 STREAMS = ("/proc/", "/dev/fd/")  # where a process finds the files it has open
@@ -63,161 +37,7 @@ class FileError(ValueError):
     """A file that cannot be used; the message names its path and what is wrong."""
 
 
-class Record:
-    """An object of a file, of which each field is taken once.
-
-    Parameters
-    ----------
-    where : str
-        How messages call it: the path, and the field it stands in.
-    fields : dict
-        Its fields.
-    """
-
-    def __init__(self, where: str, fields: dict[str, Any]) -> None:
-        self.where = where
-        self._left = fields
-
-    def take(self, name: str) -> Any:
-        """Return a field's value, whatever it is."""
-        if name not in self._left:
-            raise FileError(f"{self.where}: lacks the field {name!r}")
-        return self._left.pop(name)
-
-    def error(self, name: str, rule: str, value: object = ...) -> FileError:
-        """Return the error that says what a field must be, and what it is, if given."""
-        got = "" if value is ... else f", got {_shown(value)}"
-        return FileError(f"{self.where}: field {name!r} {rule}{got}")
-
-    def record(self, name: str) -> Record:
-        """Return a field that is an object."""
-        value = self.take(name)
-        if type(value) is not dict:
-            raise self.error(name, "must be an object", value)
-        return Record(f"{self.where}: field {name!r}", value)
-
-    def number(self, name: str, null: Any = ...) -> Any:
-        """Return a field that is a whole number from 0, or ``null`` for a null, if given."""
-        value = self.take(name)
-        if value is None and null is not ...:
-            return null
-        if type(value) is not int or not 0 <= value <= MAX_INTEGER:
-            raise self.error(name, f"must be an integer in 0..{MAX_INTEGER}", value)
-        return value
-
-    def real(self, name: str) -> float:
-        """Return a field that is a finite number from 0."""
-        value = self.take(name)
-        if type(value) not in (int, float) or not 0 <= value <= MAX_INTEGER:
-            raise self.error(name, f"must be a number in 0..{MAX_INTEGER}", value)
-        return float(value)
-
-    def text(self, name: str, limit: int) -> str:
-        """Return a field that is a string of at most ``limit`` characters."""
-        value = self.take(name)
-        if type(value) is not str or len(value) > limit:
-            raise self.error(name, f"must be a string of at most {limit} characters", value)
-        return value
-
-    def choice(self, name: str, allowed: Iterable[str]) -> str:
-        """Return a field that is one of some strings."""
-        value = self.take(name)
-        options = tuple(allowed)
-        if type(value) is not str or value not in options:
-            raise self.error(name, f"must be one of {', '.join(options)}", value)
-        return value
-
-    def cells(self, name: str) -> tuple[int, ...]:
-        """Return a field that is a list of whole numbers from 0."""
-        return self._cells(name, self.take(name))
-
-    def cell_lists(self, name: str, count: int) -> tuple[tuple[int, ...], ...]:
-        """Return a field that is a list of ``count`` lists of whole numbers from 0."""
-        value = self._list(name, count)
-        return tuple(self._cells(f"{name}[{index}]", line) for index, line in enumerate(value))
-
-    def holds_strings(self, name: str) -> bool:
-        """Return whether a field is there and a list of strings alone; it is not taken."""
-        value = self._left.get(name)
-        return type(value) is list and all(type(line) is str for line in value)
-
-    def strings(self, name: str, count: int, letters: str) -> tuple[str, ...]:
-        """Return a field that is a list of ``count`` strings of certain letters."""
-        value = self._list(name, count)
-        if not all(type(line) is str and set(line) <= set(letters) for line in value):
-            raise self.error(name, f"must be strings of {letters!r}", value)
-        return tuple(value)
-
-    def finish(self) -> None:
-        """Raise an error if a field was not taken."""
-        for name in self._left:
-            raise FileError(f"{self.where}: has an unknown field {describe(name)}")
-
-    def _list(self, name: str, count: int) -> list[Any]:
-        value = self.take(name)
-        if type(value) is not list or len(value) != count:
-            raise self.error(name, f"must be a list of {count}", value)
-        return value
-
-    def _cells(self, name: str, value: object) -> tuple[int, ...]:
-        if type(value) is not list:
-            raise self.error(name, "must be a list", value)
-        for item in value:
-            if type(item) is not int or not 0 <= item <= MAX_INTEGER:
-                raise self.error(name, f"must hold integers in 0..{MAX_INTEGER}", item)
-        return tuple(value)
-
-
 # -- reading ---------------------------------------------------------------
-
-
-def read_record(path: str | os.PathLike[str], kind: str, limit: int) -> Record:
-    """Read a file of one JSON object and check what it says it is.
-
-    Parameters
-    ----------
-    path : str or os.PathLike
-        A regular file.
-    kind : str
-        What it must be: "problem" or "plan".
-    limit : int
-        Largest size in bytes.
-
-    Returns
-    -------
-    Record
-        The fields but for ``format`` and ``version``.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, is not strict JSON, or is of another kind or version.
-    """
-    data = read_bytes(path, limit, f"a {kind} file", FileError)
-    where = os.fspath(path)
-    if sum(map(data.count, (b"[", b"{", b":", b'"'))) > MAX_MARKS:
-        raise FileError(
-            f"{where}: is no {kind} file: has more than {MAX_MARKS} brackets, colons and quotes"
-        )
-    try:
-        value = json.loads(
-            data.decode("utf-8"),
-            object_pairs_hook=unique_fields,
-            parse_constant=_refuse_constant,
-            parse_float=_finite,
-        )
-    except RecursionError:
-        raise FileError(f"{where}: is nested too deeply") from None
-    except ValueError as error:  # of JSON, of UTF-8, of the three checks above
-        raise FileError(f"{where}: is not strict JSON: {error}") from error
-    if type(value) is not dict:
-        raise FileError(f"{where}: must hold a JSON object, got {_shown(value)}")
-    record = Record(where, value)
-    record.choice("format", [f"mapp_env {kind}"])
-    version = record.number("version")
-    if version != VERSION:
-        raise record.error("version", f"must be {VERSION}", version)
-    return record
 
 
 def read_bytes(
@@ -270,60 +90,79 @@ def read_bytes(
     return data
 
 
-def _named(path: str | os.PathLike[str]) -> str:
-    """Return a path for a message, whole unless it is absurdly long."""
-    return describe(os.fspath(path), MAX_PATH_LETTERS)
+def read_json(
+    path: str | os.PathLike[str],
+    limit: int,
+    what: str,
+    error_type: type[ValueError] = FileError,
+    max_marks: int | None = None,
+) -> Any:
+    """Return the value in a file of strict JSON: :func:`read_bytes`, then :func:`parse_json`.
+
+    ``max_marks`` is the most brackets, colons and quotes that such a file may have: a parser may
+    need a second for millions of them. By default there may be any number.
+    """
+    data = read_bytes(path, limit, what, error_type)
+    where = os.fspath(path)
+    if max_marks is not None and sum(map(data.count, (b"[", b"{", b":", b'"'))) > max_marks:
+        raise error_type(f"{where}: has more than {max_marks} brackets, colons and quotes")
+    return parse_json(data, where, error_type)
 
 
-def _shown(value: object) -> str:
-    """Return a value of a file for a message; to print a list could take long, or nest too deep."""
-    if isinstance(value, list | dict):
-        return f"a {type(value).__name__} of {len(value)}"
-    return describe(value)
+def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = FileError) -> Any:
+    """Return the value of a strict JSON text, UTF-8 if it is bytes.
+
+    Numbers are finite, and no object has a key twice: two readers could differ on it.
+
+    Parameters
+    ----------
+    data : str or bytes
+        The text; its size is for the caller to limit.
+    where : object
+        How messages call it: a path.
+    error_type : type
+        What is raised.
+
+    Raises
+    ------
+    ValueError
+        As ``error_type``, if it is not strict JSON or nested too deeply.
+    """
+    try:
+        return json.loads(
+            data if isinstance(data, str) else data.decode("utf-8"),
+            object_pairs_hook=unique_fields,
+            parse_constant=_finite,
+            parse_float=_finite,
+        )
+    except RecursionError:
+        raise error_type(f"{where}: is nested too deeply") from None
+    except ValueError as error:
+        raise error_type(f"{where}: is not strict JSON: {error}") from error
 
 
 def unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return an object of JSON, but refuse one with a key twice: two readers could differ on it."""
+    """Return an object of JSON, but refuse one with a key twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
         raise ValueError("an object has the same key twice")
     return fields
 
 
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")
-
-
 def _finite(text: str) -> float:
+    """Return a number that JSON has: not ``NaN``, ``Infinity`` or ``1e999``."""
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{describe(text)} is too large a number")
+        raise ValueError(f"{describe(text)} is not a finite number")
     return number
 
 
+def _named(path: str | os.PathLike[str]) -> str:
+    """Return a path for a message, whole unless it is absurdly long."""
+    return describe(os.fspath(path), MAX_PATH_LETTERS)
+
+
 # -- writing ---------------------------------------------------------------
-
-
-def write_record(
-    path: str | os.PathLike[str], kind: str, fields: Mapping[str, Any], limit: int
-) -> None:
-    """Write one JSON object, one field a line, as :func:`read_record` reads it.
-
-    Raises
-    ------
-    FileError
-        If it would be larger than ``limit`` bytes, or cannot be written.
-    """
-    lines = [
-        f" {json.dumps(name)}: {json.dumps(value, allow_nan=False)}"
-        for name, value in labelled(kind, fields).items()
-    ]
-    write_text(path, "{\n" + ",\n".join(lines) + "\n}\n", limit)
-
-
-def labelled(kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a file with what says that it is one."""
-    return {"format": f"mapp_env {kind}", "version": VERSION, **fields}
 
 
 def write_text(path: str | os.PathLike[str], text: str, limit: int) -> None:

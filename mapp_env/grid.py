@@ -16,10 +16,13 @@ from mapp_env.compiled import kernel
 from mapp_env.map_format import MAX_SIDE, MapError, ParsedMap, parse_map, read_map
 from mapp_env.validation import as_integer, describe
 
-__all__ = ["MAX_ALL_PAIRS_CELLS", "Grid"]
+__all__ = ["FAR", "MAX_ALL_PAIRS_CELLS", "Grid"]
 
 MAX_ALL_PAIRS_CELLS = 4096
 """Largest number of cells for which all pairs of distances are kept (64 MiB at 4096)."""
+
+FAR = np.int32(1 << 29)
+"""More than any route of an agent, and twice it is still an int32."""
 
 UNREACHABLE = -1
 
@@ -205,6 +208,11 @@ class Grid:
             f"{self.rows} x {self.cols}, got {describe(value)}"
         )
 
+    def _cells(self, cells: Iterable[int]) -> NDArray[np.int32]:
+        if not isinstance(cells, Iterable):
+            raise ValueError(f"cells must be a sequence of cells, got {describe(cells)}")
+        return np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
+
     def _centre(self) -> int:
         """Return the free cell nearest to the middle of the grid."""
         free = np.flatnonzero(~self.walls)
@@ -274,9 +282,7 @@ class Grid:
         ValueError
             If a cell is off the grid.
         """
-        if not isinstance(cells, Iterable):
-            raise ValueError(f"cells must be a sequence of cells, got {describe(cells)}")
-        starts = np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
+        starts = self._cells(cells)
         fields = np.empty((len(starts), self.n_cells), dtype=np.int32)
         queue = np.empty(self.n_cells, dtype=np.int32)
         walls = self.walls.ravel()
@@ -286,6 +292,18 @@ class Grid:
             else:
                 fill_distances(self.moves, start, fields[index], queue)
         return fields
+
+    def manhattan_from(self, cells: Iterable[int]) -> NDArray[np.int32]:
+        """Return the Manhattan distances from each of ``cells`` to every cell, shape (S, C) int32.
+
+        Raises
+        ------
+        ValueError
+            If a cell is off the grid.
+        """
+        starts = self._cells(cells)
+        row, col = np.divmod(np.arange(self.n_cells, dtype=np.int32), self.cols)
+        return abs(row[starts, None] - row) + abs(col[starts, None] - col)
 
     def path(self, start: int, end: int) -> tuple[int, ...]:
         """Return a shortest path, both ends included; among equals the first in action order.

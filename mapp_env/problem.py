@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.files import MAX_PROBLEM_BYTES, FileError, Record, read_record, write_record
+from mapp_env.files import FileError
 from mapp_env.grid import Grid
+from mapp_env.records import MAX_PROBLEM_BYTES, Record, read_record, write_record
 from mapp_env.validation import check_count, describe
 
 __all__ = [

@@ -9,8 +9,7 @@ landmarks among the agents.
 import numpy as np
 
 from mapp_env.compiled import nogil_kernel
-
-FAR = 1 << 20
+from mapp_env.grid import FAR
 
 
 def steps_left(

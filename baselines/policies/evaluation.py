@@ -17,10 +17,11 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.policies.acting import Acting, check_grid
 from baselines.policies.episodes import begin
-from baselines.policies.policy import MAX_TABLE_CELLS, EarliestArrivalPolicy, NearestLandmarkPolicy
+from baselines.policies.policy import EarliestArrivalPolicy, NearestLandmarkPolicy
 from baselines.policies.settings import Setting
 from mapp_env import Problem, make_vec, sample_problems, solve
 from mapp_env.files import write_text
+from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.solvers import optimal_costs, solve_universe
 from mapp_env.validation import check_count
 
@@ -126,9 +127,9 @@ def rules_of_thumb(setting: Setting) -> dict[str, Acting]:
     There are none, and a line says so, on a grid for which the distances of all pairs of cells are
     not kept.
     """
-    if setting.grid.n_cells > MAX_TABLE_CELLS:
+    if setting.grid.n_cells > MAX_ALL_PAIRS_CELLS:
         names = " and ".join(label for label, _ in RULES.values())
-        print(f"no rows for {names}: the grid has more than {MAX_TABLE_CELLS:,} cells")
+        print(f"no rows for {names}: the grid has more than {MAX_ALL_PAIRS_CELLS:,} cells")
         return {}
     task = setting.grid, setting.n_agents, setting.n_landmarks
     return {label: rule(*task) for label, rule in RULES.values()}

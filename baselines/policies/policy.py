@@ -20,6 +20,7 @@ from baselines.policies.settings import read_grid
 from baselines.runs.folder import CONFIG_FILE, WEIGHTS_FILE, parse_json
 from mapp_env import Grid
 from mapp_env.files import read_bytes, write_bytes
+from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.validation import check_count
 
@@ -30,7 +31,6 @@ MAX_WEIGHTS_BYTES = 80 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024
 ZIP = b"PK\x03\x04"  # how such a file begins
 PRETRAINED = Path(__file__).parents[1] / "pretrained"  # a folder for each name, like a run's
-MAX_TABLE_CELLS = 4096  # the most cells for which a Grid keeps the distances of all pairs
 
 
 class NetworkPolicy:
@@ -106,7 +106,7 @@ class NearestLandmarkPolicy:
 
     def __init__(self, grid: Grid, n_agents: int, n_landmarks: int) -> None:
         # The table of first moves has one entry per pair of cells.
-        check_count("n_cells", grid.n_cells, 2, MAX_TABLE_CELLS)
+        check_count("n_cells", grid.n_cells, 2, MAX_ALL_PAIRS_CELLS)
         self.grid, self.n_agents, self.n_landmarks = grid, n_agents, n_landmarks
         distances = np.asarray(grid.distances)  # (C, C), -1 unreachable
         self.distances = np.where(distances < 0, np.iinfo(np.int32).max, distances)

@@ -39,8 +39,7 @@ def relabelled_reward(grid: Grid, reward: str, scale: float) -> RelabelledReward
         return RelabelledReward(np.zeros((0, 0), np.float32), scale)
     if reward == "geodesic":
         return RelabelledReward(np.asarray(grid.distances, np.float32), scale)
-    rows, cols = np.divmod(np.arange(grid.n_cells), grid.cols)
-    steps = abs(rows[:, None] - rows) + abs(cols[:, None] - cols)
+    steps = grid.manhattan_from(range(grid.n_cells))
     return RelabelledReward(steps.astype(np.float32), scale)
 
 

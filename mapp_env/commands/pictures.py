@@ -61,25 +61,18 @@ def picture_writer(
     if suffix in FIGURES and fps is not None:
         raise ValueError("--fps is for animations: it does not go with a figure")
     check_file(option, out)
-    if suffix in ANIMATIONS:
-        return _animation(out, DEFAULT_FPS if fps is None else fps)
-    return _figure(out)
+    if suffix in FIGURES:
+        from mapp_env.rendering import draw_plan, save_figure
 
+        def draw_figure(problem: Problem, plan: Plan) -> int:
+            figure: Any = draw_plan(problem, plan).figure  # as no axes were given, all of one
+            return save_figure(figure, out)
 
-def _animation(out: str, fps: float) -> Callable[[Problem, Plan], int]:
-    def write(problem: Problem, plan: Plan) -> int:
+        return draw_figure
+
+    def animate(problem: Problem, plan: Plan) -> int:
         from mapp_env.rendering import save_animation
 
-        return save_animation(out, problem, plan.actions, fps)
+        return save_animation(out, problem, plan.actions, DEFAULT_FPS if fps is None else fps)
 
-    return write
-
-
-def _figure(out: str) -> Callable[[Problem, Plan], int]:
-    from mapp_env.rendering import draw_plan, save_figure
-
-    def write(problem: Problem, plan: Plan) -> int:
-        figure: Any = draw_plan(problem, plan).figure  # as no axes were given, not a part of one
-        return save_figure(figure, out)
-
-    return write
+    return animate

@@ -56,28 +56,37 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
     module, _, function = loader.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), function)):
         raise ValueError(f"--policy-loader must be MODULE:FUNCTION, got {describe(loader)}")
-    with contextlib.nullcontext() if loader == DEFAULT_LOADER else _working_folder_last():
+    own = loader == DEFAULT_LOADER
+    with contextlib.nullcontext() if own else _working_folder_last():
         try:
-            load = getattr(importlib.import_module(module), function)
+            with _refusing(
+                f"--policy-loader {loader} cannot be imported", ImportError, AttributeError
+            ):
+                load = getattr(importlib.import_module(module), function)
         except (ImportError, AttributeError) as error:
-            hint = (
-                ': install the repository in editable mode, pip install -e ".[baselines]"'
-                if loader == DEFAULT_LOADER
-                else ""
-            )
-            raise ImportError(f"policies are loaded by {loader}, but: {error}{hint}") from error
-        except Exception as error:  # whatever it is, it is the loader's, not ours
-            raise ValueError(f"--policy-loader {loader} cannot be imported: {error!r}") from error
-        try:
+            hint = ': install the repository in editable mode, pip install -e ".[baselines]"'
+            raise ImportError(
+                f"policies are loaded by {loader}, but: {error}{hint if own else ''}"
+            ) from error
+        with _refusing(f"--policy {describe(name)}: {loader} refuses it"):
             policy: Policy = load(name)
-        except Exception as error:  # whatever it is, it is the loader's, not ours
-            reason = str(error) if isinstance(error, ValueError) else repr(error)
-            raise ValueError(f"--policy {describe(name)}: {loader} refuses it: {reason}") from error
     if not callable(getattr(policy, "act", None)):
         raise ValueError(
             f"--policy-loader must return something with act(), {loader} returns {describe(policy)}"
         )
     return policy
+
+
+@contextlib.contextmanager
+def _refusing(what: str, *others: type[Exception]) -> Iterator[None]:
+    """Say that a loader or a policy fails, whatever it raises: the fault is not ours."""
+    try:
+        yield
+    except others:
+        raise
+    except Exception as error:
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise ValueError(f"{what}: {reason}") from error
 
 
 @contextlib.contextmanager
@@ -107,7 +116,13 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
         If the policy was trained on another grid, cannot play such a problem, or its actions are
         none.
     """
-    _check_grid(policy, problem.grid)
+    with _refusing("--policy cannot play this problem"):
+        grid = getattr(policy, "grid", None)  # one that names none plays on any
+    if isinstance(grid, Grid) and grid != problem.grid:
+        raise ValueError(
+            "--policy cannot play this problem: it was trained on another grid; here "
+            f"{tell_apart(problem.grid, grid)}"
+        )
     env = CentralEnv(
         problem.grid,
         problem.n_agents,
@@ -124,27 +139,10 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     return replay(replace(problem, max_cycles=max_cycles), np.array(actions))
 
 
-def _check_grid(policy: Policy, grid: Grid) -> None:
-    """Refuse a policy of another grid; one that names none plays on any."""
-    try:
-        own = getattr(policy, "grid", None)
-    except Exception as error:  # whatever it is, it is the policy's, not ours
-        reason = str(error) if isinstance(error, ValueError) else repr(error)
-        raise ValueError(f"--policy cannot play this problem: {reason}") from error
-    if isinstance(own, Grid) and own != grid:
-        raise ValueError(
-            "--policy cannot play this problem: it was trained on another grid; here "
-            f"{tell_apart(grid, own)}"
-        )
-
-
 def _act(policy: Policy, observation: NDArray[np.float32], n_agents: int) -> NDArray[np.int64]:
     """Return a policy's joint action, shape (N,)."""
-    try:
+    with _refusing("--policy cannot play this problem"):
         found = np.asarray(policy.act(observation[None]))
-    except Exception as error:  # whatever it is, it is the policy's, not ours
-        reason = str(error) if isinstance(error, ValueError) else repr(error)
-        raise ValueError(f"--policy cannot play this problem: {reason}") from error
     if found.shape != (1, n_agents) or found.dtype.kind not in "iu":
         raise ValueError(
             f"--policy must act with integers of shape (1, {n_agents}), got shape {found.shape}, "

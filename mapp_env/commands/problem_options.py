@@ -141,36 +141,27 @@ def grid_of(arguments: argparse.Namespace) -> Grid:
         If there is none.
     """
     name = GRID if arguments.grid is None else arguments.grid
-    if arguments.grid_seed is not None:
-        check_count("--grid-seed", arguments.grid_seed, 0, MAX_DRAWN)
-    options = {
-        option: value
-        for option, value in (
-            ("rows", arguments.rows),
-            ("cols", arguments.cols),
-            ("seed", arguments.grid_seed),
-        )
-        if value is not None
-    }
-    depot = arguments.depot
-    if depot is not None and name in (*generator_names(), *grid_names()):
+    bundled, generators = grid_names(), generator_names()
+    given = {"rows": arguments.rows, "cols": arguments.cols, "seed": arguments.grid_seed}
+    options = {option: value for option, value in given.items() if value is not None}
+    if "seed" in options:
+        check_count("--grid-seed", options["seed"], 0, MAX_DRAWN)
+    if arguments.depot is not None and name in (*generators, *bundled):
         raise ValueError(f"--depot is for map files, not for {describe(name)}")
-    if name in generator_names():
-        return make_grid(name, **options)
-    if options:
+    if options and name not in generators:
         raise ValueError(
             "--rows, --cols and --grid-seed are for generated grids "
-            f"(--grid {' | '.join(generator_names())}), not for {describe(name)}"
+            f"(--grid {' | '.join(generators)}), not for {describe(name)}"
         )
-    if name not in grid_names() and not os.path.lexists(name):
+    if name in (*generators, *bundled):
+        return make_grid(name, **options)
+    if not os.path.lexists(name):
         raise ValueError(
-            f"--grid must be one of {', '.join((*grid_names(), *generator_names()))} or a map "
-            f"file, and there is no file {describe(name)}"
+            f"--grid must be one of {', '.join((*bundled, *generators))} or a map file, and there "
+            f"is no file {describe(name)}"
         )
-    if name in grid_names():
-        return make_grid(name)
     try:
-        return Grid.load(name, depot)
+        return Grid.load(name, arguments.depot)
     except ValueError as error:
         raise ValueError(f"--grid {error}") from error
 

@@ -102,20 +102,10 @@ def run(arguments: argparse.Namespace) -> None:
     draw = picture_writer("--out", arguments.out, arguments.fps)
     problem, plan = _plan_of(arguments)
     size = draw(problem, plan)
-    print_report(
-        arguments,
-        {
-            "out": arguments.out,
-            "bytes": size,
-            "landmarks": list(problem.landmarks),
-            **costs_record(plan),
-        },
-        [
-            f"wrote {arguments.out}: {size} bytes",
-            costs_line(problem, plan),
-            landmarks_line(problem),
-        ],
-    )
+    record = {"out": arguments.out, "bytes": size, "landmarks": list(problem.landmarks)}
+    wrote = f"wrote {arguments.out}: {size} bytes"
+    lines = [wrote, costs_line(problem, plan), landmarks_line(problem)]
+    print_report(arguments, {**record, **costs_record(plan)}, lines)
 
 
 def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:

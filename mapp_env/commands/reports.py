@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from typing import Any
 
-from mapp_env.plans.plan import OBJECTIVES, Plan
+from mapp_env.plans.plan import OBJECTIVES, Plan, json_costs
 from mapp_env.problem import Problem
 
 __all__ = [
@@ -79,10 +78,9 @@ def landmarks_line(problem: Problem) -> str:
 
 def costs_record(plan: Plan) -> dict[str, Any]:
     """Return the same for programs; a cost that is infinite is null."""
-    costs = {name: getattr(plan, name) for name in OBJECTIVES}
     return {
         "success": plan.success,
-        **{name: None if cost == math.inf else int(cost) for name, cost in costs.items()},
+        **json_costs(plan),
         "objective": plan.objective,
         "status": plan.status,
         "bound": plan.bound,

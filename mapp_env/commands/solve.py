@@ -17,14 +17,9 @@ import argparse
 
 from mapp_env.commands.pictures import PICTURES, check_file, picture_writer
 from mapp_env.commands.problem_options import add_problem_options, problem_of, seed_of
-from mapp_env.commands.reports import (
-    add_json_option,
-    costs_line,
-    landmarks_line,
-    print_report,
-)
-from mapp_env.files import labelled
-from mapp_env.plans.plan import OBJECTIVES, Plan
+from mapp_env.commands.reports import add_json_option, costs_line, landmarks_line, print_report
+from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.records import MAX_PLAN_BYTES, labelled, write_record
 from mapp_env.solvers import METHODS, solve
 
 __all__ = ["add_arguments", "run"]
@@ -73,29 +68,21 @@ def run(arguments: argparse.Namespace) -> None:
             raise ValueError("--picture must be another file than --out")
         draw = picture_writer("--picture", arguments.picture)
     problem = problem_of(arguments)
-    plan = solve(
-        problem,
-        arguments.objective,
-        arguments.method,
-        arguments.time_limit,
-        seed_of(arguments),
-    )
+    options = (arguments.objective, arguments.method, arguments.time_limit)
+    plan = solve(problem, *options, seed_of(arguments))
+    record = plan.to_record()
     if draw is not None:
         draw(problem, plan)  # first, as more can stand in its way
     if arguments.out is not None:
-        plan.save(arguments.out)
-    lines = [costs_line(problem, plan), landmarks_line(problem)]
-    lines += [*_tour_lines(plan), _made_line(plan)]
-    lines += [f"wrote {name}" for name in (arguments.out, arguments.picture) if name is not None]
-    print_report(arguments, labelled("plan", plan.to_record()), lines)
-
-
-def _tour_lines(plan: Plan) -> list[str]:
-    return [
-        f"agent {agent}: {' '.join(map(str, tour)) or 'stays at the depot'}"
-        for agent, tour in enumerate(plan.tours)
+        write_record(arguments.out, "plan", record, MAX_PLAN_BYTES)
+    lines = [
+        costs_line(problem, plan),
+        landmarks_line(problem),
+        *(
+            f"agent {agent}: {' '.join(map(str, tour)) or 'stays at the depot'}"
+            for agent, tour in enumerate(plan.tours)
+        ),
+        f"by {plan.solver} in {1000 * plan.seconds:.1f} ms",
+        *(f"wrote {name}" for name in (arguments.out, arguments.picture) if name is not None),
     ]
-
-
-def _made_line(plan: Plan) -> str:
-    return f"by {plan.solver} in {1000 * plan.seconds:.1f} ms"
+    print_report(arguments, labelled("plan", record), lines)

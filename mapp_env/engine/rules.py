@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.grid import Grid
+from mapp_env.grid import FAR, Grid
 
 __all__ = [
     "ALL_PAIRS",
@@ -69,8 +69,6 @@ MAX_TABLE_CELLS = (
 NO_DISTANCES = np.zeros((1, 1), np.int32)
 NO_DISTANCES.flags.writeable = False
 
-FAR = np.int32(1 << 30)  # more than any distance on a grid
-
 
 class Reward(IntEnum):
     """The kinds of team reward (R6); :func:`step_row` takes their numbers."""
@@ -97,8 +95,7 @@ def cell_table(grid: Grid) -> NDArray[np.int32]:
 
 def manhattan_table(grid: Grid) -> NDArray[np.int32]:
     """Return the Manhattan distances between all pairs of cells, shape (C, C) int32."""
-    row, col = np.divmod(np.arange(grid.n_cells, dtype=np.int32), grid.cols)
-    table = abs(row[:, None] - row) + abs(col[:, None] - col)
+    table = grid.manhattan_from(range(grid.n_cells))
     table.flags.writeable = False
     return table
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapp_env.grid import Grid
 from mapp_env.map_format import MAX_SIDE
-from mapp_env.validation import MAX_SEED, as_real, check_count, describe
+from mapp_env.validation import MAX_SEED, check_count, check_number
 
 __all__ = ["GENERATORS", "maze_grid", "random_grid", "rooms_grid", "warehouse_grid"]
 
@@ -47,7 +47,7 @@ def random_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, density: float
         If an argument is invalid.
     """
     rng = _start(rows, cols, 2, seed)
-    density = _check_share("density", density, MAX_DENSITY)
+    density = check_number("density", density, 0, MAX_DENSITY)
     for _ in range(TRIES):
         walls = np.zeros((rows, cols), np.bool_)
         order = np.argsort(rng.random(rows * cols), kind="stable")
@@ -145,14 +145,14 @@ def maze_grid(*, rows: int = 33, cols: int = 33, seed: int = 0, loops: float = 0
         If an argument is invalid.
     """
     rng = _start(rows, cols, 3, seed)
-    loops = _check_share("loops", loops, 1.0)
+    loops = check_number("loops", loops, 0, 1)
     walls = np.ones((rows, cols), np.bool_)
     rows, cols = (rows + 1) // 2, (cols + 1) // 2
     walls[::2, ::2] = False
     # Depth first: from the end of the way to a neighbour that is not on it, else one step back.
     start = (_below(rng, rows), _below(rng, cols))
-    seen = np.zeros((rows, cols), np.bool_).tolist()
-    seen[start[0]][start[1]] = True
+    reached = np.zeros((rows, cols), np.bool_).tolist()
+    reached[start[0]][start[1]] = True
     way = [start]
     words = iter(rng.random(rows * cols).tolist())
     while way:
@@ -160,13 +160,13 @@ def maze_grid(*, rows: int = 33, cols: int = 33, seed: int = 0, loops: float = 0
         ahead = [
             (r, c)
             for r, c in ((row, col - 1), (row, col + 1), (row - 1, col), (row + 1, col))
-            if 0 <= r < rows and 0 <= c < cols and not seen[r][c]
+            if 0 <= r < rows and 0 <= c < cols and not reached[r][c]
         ]
         if not ahead:
             way.pop()
             continue
         r, c = ahead[int(next(words) * len(ahead))]
-        seen[r][c] = True
+        reached[r][c] = True
         walls[row + r, col + c] = False
         way.append((r, c))
     # Opened last, so that more loops only take walls away.
@@ -209,7 +209,7 @@ def warehouse_grid(
     rng = _start(rows, cols, 6, seed)
     length = check_count("shelf_length", shelf_length, 2, MAX_SIDE // 2)
     aisle = check_count("aisle", aisle, 1, 8)
-    gaps = _check_share("gaps", gaps, 1.0)
+    gaps = check_number("gaps", gaps, 0, 1)
     walls = np.zeros((rows, cols), np.bool_)
     for top, bottom in _shelves(rows - 1, 2, aisle):  # one more free row for the depot
         for left, right in _shelves(cols, length, aisle):
@@ -231,14 +231,6 @@ def _start(rows: object, cols: object, low: int, seed: object) -> np.random.Gene
     check_count("rows", rows, low, MAX_SIDE)
     check_count("cols", cols, low, MAX_SIDE)
     return np.random.default_rng(check_count("seed", seed, 0, MAX_SEED))
-
-
-def _check_share(name: str, value: object, high: float) -> float:
-    """Return ``value`` as a float in 0..high."""
-    number = as_real(value)
-    if number is None or not 0 <= number <= high:
-        raise ValueError(f"{name} must be a number in 0..{high:g}, got {describe(value)}")
-    return number
 
 
 def _below(rng: np.random.Generator, n: int) -> int:

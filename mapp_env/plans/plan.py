@@ -11,18 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.engine.rules import WAIT
-from mapp_env.files import (
-    MAX_INTEGER,
-    MAX_PLAN_BYTES,
-    FileError,
-    Record,
-    read_record,
-    write_record,
-)
-from mapp_env.plans.replay import Played, check_joint_actions, play
-from mapp_env.plans.tour_checks import check_claims, check_tours
-from mapp_env.plans.walking import moves_of, tour_of, walk_tours
+from mapp_env.files import FileError
+from mapp_env.plans.replay import Episode, check_joint_actions, play_episode
+from mapp_env.plans.tours import check_tours, moves_of, tour_of, walk_tours
 from mapp_env.problem import MAX_CYCLES, Problem
+from mapp_env.records import MAX_INTEGER, MAX_PLAN_BYTES, Record, read_record, write_record
 from mapp_env.validation import as_integer, as_real, check_choice, describe
 
 __all__ = ["OBJECTIVES", "STATUSES", "Plan", "replay"]
@@ -145,8 +138,8 @@ class Plan:
     def verify(self, problem: Problem | None = None) -> None:
         """Check that tours, claims and costs are right for a problem, under the rules.
 
-        Every tour is walked cell by cell, and the recorded actions (for a plan made by hand: the
-        tours, without a pause) are carried out anew; the problem's step limit is ignored.
+        The recorded actions (for a plan made by hand: the tours, without a pause) are carried out,
+        and all that the plan states is compared; the problem's step limit is ignored.
 
         Parameters
         ----------
@@ -157,20 +150,18 @@ class Plan:
         ------
         ValueError
             That says what is wrong: a tour that does not start and end at the depot, jumps or runs
-            into a wall; a landmark that is missing or claimed twice; a wrong number of agents; a
-            detour after the last claim; a cost that is not what the rules give; a status or bound
-            that contradicts the cost.
+            into a wall; a wrong number of agents; tours, claims or a cost that are not what the
+            rules give; a status or bound that contradicts the cost.
         """
-        self._verify(problem)
+        self._verify(self.problem if problem is None else problem)
 
     def _verify(
-        self, problem: Problem | None = None, actions: NDArray[np.int64] | None = None
-    ) -> tuple[Problem, Played]:
+        self, problem: Problem | None, actions: NDArray[np.int64] | None = None
+    ) -> tuple[Problem, Episode]:
         """Verify, and return the problem and what the rules make of the plan.
 
         ``actions`` are the plan's own, shape (T, N), if they are at hand as an array.
         """
-        problem = self.problem if problem is None else problem
         if not isinstance(problem, Problem):
             raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
         self._verify_labels()
@@ -180,15 +171,13 @@ class Plan:
                 f"the problem has {problem.n_agents} agents"
             )
         check_tours(problem, self.tours)
-        check_claims(problem, self.tours, self.claims, self.success)
-        unlimited = replace(problem, max_cycles=None)
         if actions is None and not self.actions and any(self.tours):
-            actions = walk_tours(unlimited, self.tours)
+            actions = walk_tours(problem, self.tours)
         if actions is None:
             actions = check_joint_actions(self.actions, problem.n_agents)
-        played = play(unlimited, actions)
+        episode = play_episode(replace(problem, max_cycles=None), actions)
         for name in (*OBJECTIVES, "claims", "tours"):
-            stated, given = getattr(self, name), getattr(played, name)
+            stated, given = getattr(self, name), getattr(episode, name)
             if stated != given:
                 raise ValueError(
                     f"plan: {name} is stated as {describe(stated)}, the rules give "
@@ -197,10 +186,10 @@ class Plan:
         for name in ("claim_steps", "actions"):
             stated = getattr(self, name)
             # A plan made by hand may leave both out.
-            if stated != getattr(played, name) and (stated or self.actions):
+            if stated != getattr(episode, name) and (stated or self.actions):
                 raise ValueError("plan: claim_steps and actions are not what the rules give")
         self._verify_status()
-        return problem, played
+        return problem, episode
 
     def _verify_labels(self) -> None:
         check_choice("objective", self.objective, OBJECTIVES)
@@ -257,11 +246,11 @@ class Plan:
         ValueError
             If the plan is not right (:meth:`verify`), or longer than any episode.
         """
-        problem, played = self._verify()
-        if len(played.actions) > MAX_CYCLES:
-            raise FileError(f"plan: has {len(played.actions)} steps, a file holds {MAX_CYCLES}")
+        problem, episode = self._verify(self.problem)
+        if len(episode.actions) > MAX_CYCLES:
+            raise FileError(f"plan: has {len(episode.actions)} steps, a file holds {MAX_CYCLES}")
         # As played: what is equal but of another type, NumPy's integers say, is no JSON.
-        columns = zip(*played.actions, strict=True) if played.actions else [()] * len(self.tours)
+        columns = zip(*episode.actions, strict=True) if episode.actions else [()] * len(self.tours)
         return {
             "problem": problem.to_record(),
             "objective": self.objective,
@@ -269,10 +258,10 @@ class Plan:
             "solver": self.solver,
             "seconds": float(self.seconds),
             "bound": None if self.bound is None else int(self.bound),
-            **{name: _or_null(getattr(played, name)) for name in OBJECTIVES},
-            "tours": _spelled(problem, played.tours),
-            "claims": played.claims,
-            "claim_steps": played.claim_steps,
+            **json_costs(episode),
+            "tours": _spelled(problem, episode.tours),
+            "claims": episode.claims,
+            "claim_steps": episode.claim_steps,
             "actions": ["".join(map(str, column)) for column in columns],
         }
 
@@ -317,7 +306,7 @@ class Plan:
         )
         source.finish()
         try:
-            plan._verify(actions=actions)
+            plan._verify(problem, actions)
         except ValueError as error:
             raise FileError(f"{source.where}: {error}") from error
         return plan
@@ -343,9 +332,10 @@ def _read_tours(source: Record, problem: Problem, n_steps: int) -> tuple[tuple[i
     return tuple(tour_of(problem.grid, line) for line in moves)
 
 
-def _or_null(cost: float) -> int | None:
-    """Return a cost as files hold it."""
-    return None if cost == math.inf else int(cost)
+def json_costs(costs: Plan | Episode) -> dict[str, int | None]:
+    """Return the three costs as JSON holds them: one that is infinite is null."""
+    named = {name: getattr(costs, name) for name in OBJECTIVES}
+    return {name: None if cost == math.inf else int(cost) for name, cost in named.items()}
 
 
 def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_time") -> Plan:
@@ -371,6 +361,6 @@ def replay(problem: Problem, joint_actions: ArrayLike, objective: str = "cover_t
     if not isinstance(problem, Problem):
         raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
     check_choice("objective", objective, OBJECTIVES)
-    played = play(problem, check_joint_actions(joint_actions, problem.n_agents))
-    status = "feasible" if played.cover_time < math.inf else "infeasible"
-    return Plan(**played._asdict(), objective=objective, status=status, problem=problem)
+    episode = play_episode(problem, check_joint_actions(joint_actions, problem.n_agents))
+    status = "feasible" if episode.cover_time < math.inf else "infeasible"
+    return Plan(**episode._asdict(), objective=objective, status=status, problem=problem)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,11 +25,11 @@ from mapp_env.grid import Grid
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
-__all__ = ["Played", "check_joint_actions", "play"]
+__all__ = ["Episode", "check_joint_actions", "play_episode"]
 
 
-class Played(NamedTuple):
-    """An episode; :class:`~mapp_env.plans.plan.Plan` says what its fields are."""
+class Episode(NamedTuple):
+    """What was played; :class:`~mapp_env.plans.plan.Plan` says what its fields are."""
 
     tours: tuple[tuple[int, ...], ...]
     claims: tuple[tuple[int, ...], ...]
@@ -39,8 +40,10 @@ class Played(NamedTuple):
     total_distance: float
 
 
-def play(problem: Problem, actions: NDArray[np.int64]) -> Played:
+def play_episode(problem: Problem, actions: NDArray[np.int64]) -> Episode:
     """Carry out joint actions until every landmark is visited or the problem's step limit.
+
+    The last episode is kept: who checks, saves or draws a plan asks for the same once more.
 
     Parameters
     ----------
@@ -49,6 +52,13 @@ def play(problem: Problem, actions: NDArray[np.int64]) -> Played:
     actions : ndarray of int64, shape (T, N)
         From :func:`check_joint_actions`.
     """
+    return _play(problem, actions.tobytes())
+
+
+@lru_cache(maxsize=1)
+def _play(problem: Problem, data: bytes) -> Episode:
+    # Copied, as numba would compile a second version of the kernel for read-only actions.
+    actions = np.frombuffer(data, np.int64).reshape(-1, problem.n_agents).copy()
     actions = actions[: problem.max_cycles]
     n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
     table = cell_table(problem.grid)
@@ -69,7 +79,7 @@ def play(problem: Problem, actions: NDArray[np.int64]) -> Played:
             claims[agent].append(cell)
             claim_steps[agent].append(step)
     costs = measure_row(row, n_agents, n_landmarks, table)
-    return Played(
+    return Episode(
         tuple(
             _tour(problem.grid, cells[:, agent], steps_of)
             for agent, steps_of in enumerate(claim_steps)

@@ -6,7 +6,7 @@ import io
 import os
 import zlib
 from collections.abc import Iterable, Iterator
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,8 +17,8 @@ from mapp_env.engine.task import Task
 from mapp_env.files import check_writable, write_bytes
 from mapp_env.plans.plan import replay
 from mapp_env.problem import Problem
-from mapp_env.rendering.rgb_array import rgb_array
-from mapp_env.validation import check_count, check_flag, describe
+from mapp_env.rendering.rgb_array import Frame, rgb_array
+from mapp_env.validation import check_count, check_flag, check_number, describe
 
 __all__ = ["MAX_FRAMES", "MAX_PIXELS", "save_animation", "save_gif", "scenes"]
 
@@ -28,8 +28,6 @@ MAX_BYTES = 1 << 28
 MAX_SECONDS = 600
 PALETTE = 255  # one less than a GIF may have: Pillow takes one for "as before"
 FREQUENT = 128  # colours of the palette that are there for being frequent
-
-Frame: TypeAlias = NDArray[np.uint8]
 
 
 def save_animation(
@@ -127,8 +125,8 @@ def _save(
     """Write frames, whose number is known or not."""
     check_writable(path)
     # A GIF counts in hundredths of a second; viewers take less than two for ten.
-    tick = max(round(100 / _check_real("fps", fps, 0.1, 50)), 2) * 10
-    pause = round(100 * _check_real("hold", hold, 0, MAX_SECONDS)) * 10
+    tick = max(round(100 / check_number("fps", fps, 0.1, 50)), 2) * 10
+    pause = round(100 * check_number("hold", hold, 0, MAX_SECONDS)) * 10
     data = _encode(_checked(frames, n_frames), tick, tick + pause, check_flag("loop", loop))
     write_bytes(path, data, MAX_BYTES)
     return len(data)
@@ -152,16 +150,6 @@ def scenes(problem: Problem, actions: tuple[tuple[int, ...], ...]) -> Iterator[S
     for joint_action in actions:
         simulation.step(np.array(joint_action, np.int64))
         yield simulation.scene()
-
-
-# -- checking ------------------------------------------------------------------
-
-
-def _check_real(name: str, value: Any, low: float, high: float) -> float:
-    number = not isinstance(value, bool | np.bool_) and isinstance(value, int | float | np.number)
-    if not number or not low <= value <= high:
-        raise ValueError(f"{name} must be a number in {low}..{high}, got {describe(value)}")
-    return float(value)
 
 
 def _checked(frames: Iterable[Frame], n_frames: int | None) -> Iterator[Frame]:

@@ -13,7 +13,7 @@ from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering.figures import DPI, Panel, costs_of, draw_plan, save_figure
 from mapp_env.rendering.palette import INK, to_hex
-from mapp_env.rendering.rivals import Gap, check_plans, gaps
+from mapp_env.rendering.side_by_side import Gap, check_plans, gaps
 
 __all__ = ["compare_plans"]
 

@@ -32,14 +32,11 @@ from mapp_env.rendering.palette import (
 if TYPE_CHECKING:
     from mapp_env.grid import Grid
 
-__all__ = ["rgb_array"]
+__all__ = ["Frame", "paste", "rgb_array"]
 
 MAX_SIDE = 1024  # default pixels of the longer side of the grid, margins and bar not counted
 MAX_CELL = 72
-MIN_AREA = (
-    240,
-    72,
-)  # least width and height above the bar, so that a tiny grid has its bar too
+MIN_AREA = (240, 72)  # least width and height above the bar: a tiny grid has its bar, too
 MARGIN = 4
 BAR = 32
 TEXT = 20
@@ -180,11 +177,11 @@ def _draw_flag_cells(frame: Frame, layout: _Layout, scene: Scene) -> None:
 def _draw_depot_and_flags(frame: Frame, layout: _Layout, scene: Scene) -> None:
     plate = not layout.detailed
     house = icons.house(layout.icon, plate)
-    _paste(frame, house, *layout.inside(scene.grid.depot, layout.icon))
+    paste(frame, house, *layout.inside(scene.grid.depot, layout.icon))
     # Unvisited flags come last: where icons are larger than cells, they matter more.
     for visited, cell in sorted(zip(scene.visited, scene.landmarks, strict=True), reverse=True):
         flag = icons.flag(layout.icon, bool(visited), plate)
-        _paste(frame, flag, *layout.inside(cell, layout.icon))
+        paste(frame, flag, *layout.inside(cell, layout.icon))
 
 
 def _draw_trails(frame: Frame, layout: _Layout, scene: Scene) -> None:
@@ -209,7 +206,7 @@ def _draw_trails(frame: Frame, layout: _Layout, scene: Scene) -> None:
 
 def _draw_agents(frame: Frame, layout: _Layout, scene: Scene) -> None:
     for agent, (down, right, size) in enumerate(_agent_places(layout, scene.cells)):
-        _paste(frame, icons.disc(size, agent_colour(agent), str(agent)), down, right)
+        paste(frame, icons.disc(size, agent_colour(agent), str(agent)), down, right)
 
 
 def _agent_places(layout: _Layout, cells: tuple[int, ...]) -> list[_Place]:
@@ -282,10 +279,10 @@ def _draw_status(frame: Frame, layout: _Layout, scene: Scene) -> None:
     left, right = _status_texts(scene.step, scene.max_cycles, n_visited, n_landmarks)
     middle = layout.height + (BAR + 3) / 2
     icon = icons.text(left, TEXT, PAPER)
-    _paste(frame, icon, middle, BAR / 2 + icon.shape[1] / 2)
+    paste(frame, icon, middle, BAR / 2 + icon.shape[1] / 2)
     complete = n_visited == n_landmarks
     icon = icons.text(right, TEXT, blend(CHECK, PAPER, 0.55) if complete else PAPER)
-    _paste(frame, icon, middle, layout.width - BAR / 2 - icon.shape[1] / 2)
+    paste(frame, icon, middle, layout.width - BAR / 2 - icon.shape[1] / 2)
     # A thin line above the texts that fills up with the steps.
     share = min(scene.step / max(scene.max_cycles, 1), 1.0)
     line = frame[layout.height : layout.height + 3]
@@ -298,7 +295,7 @@ def _tint(frame: Frame, layout: _Layout, cell: int, colour: Colour) -> None:
     frame[top + 1 : top + layout.cell, left + 1 : left + layout.cell] = colour
 
 
-def _paste(frame: Frame, icon: icons.Icon, down: float, right: float) -> None:
+def paste(frame: Frame, icon: icons.Icon, down: float, right: float) -> None:
     """Lay an icon over the frame with its middle at a point; what is outside is cut off."""
     height, width = icon.shape[:2]
     top, left = round(down - height / 2), round(right - width / 2)

@@ -1,32 +1,30 @@
-"""Plans of one problem played side by side in one animated GIF, with Pillow."""
+"""Plans of one problem side by side: what may be, how far each is from optimal, and as a GIF."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering import icons
 from mapp_env.rendering.animation import save_gif, scenes
 from mapp_env.rendering.palette import INK, PAPER, blend
-from mapp_env.rendering.rgb_array import rgb_array
-from mapp_env.rendering.rivals import Gap, check_plans, gaps
-from mapp_env.validation import check_count
+from mapp_env.rendering.rgb_array import Frame, paste, rgb_array
+from mapp_env.validation import check_count, describe
 
-__all__ = ["animate_plans"]
+__all__ = ["MAX_PLANS", "Gap", "animate_plans", "check_plans", "gaps"]
+
+MAX_PLANS = 12
 
 BETWEEN = 12  # pixels between two panels
 INSET = 12  # pixels left of a caption
 LINE = 20  # pixels of a caption's line
 CAPTION = 2 * LINE + 12
 QUIET = blend(INK, PAPER, 0.65)
-
-Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
 
 
 def animate_plans(
@@ -103,9 +101,7 @@ def _caption(label: str, outcome: str, width: int) -> Frame:
         if string:
             icon = icons.text(string, LINE, colour)[:, : width - 2 * INSET]
             top = 6 + line * LINE
-            below = strip[top : top + icon.shape[0], INSET : INSET + icon.shape[1]]
-            alpha = icon[:, :, 3:].astype(np.uint16)
-            below[:] = (icon[:, :, :3] * alpha + below * (255 - alpha) + 127) // 255
+            paste(strip, icon, top + icon.shape[0] / 2, INSET + icon.shape[1] / 2)
     return strip
 
 
@@ -118,7 +114,70 @@ def _together(panels: list[Iterator[Frame]]) -> Iterator[Frame]:
         for frame in shown:
             row += [gap, frame] if row else [frame]
         yield np.hstack(row)
-        following = [next(panel, None) for panel in panels]
-        if all(frame is None for frame in following):
+        later = [next(panel, None) for panel in panels]
+        if all(frame is None for frame in later):
             return
-        shown = [old if new is None else new for old, new in zip(shown, following, strict=True)]
+        shown = [old if new is None else new for old, new in zip(shown, later, strict=True)]
+
+
+# -- what is compared ----------------------------------------------------
+
+
+class Gap(NamedTuple):
+    """How far a plan is from a proven optimum."""
+
+    gap: float  # (cost - optimum) / optimum
+    optimum: float
+
+
+def gaps(plans: Mapping[str, Plan]) -> dict[str, dict[str, Gap]]:
+    """Return for each plan how far it is from those that are proven optimal, by objective.
+
+    Raises
+    ------
+    ValueError
+        If a plan costs less than what is said to be the optimum.
+    """
+    optima = {plan.objective: plan.cost for plan in plans.values() if plan.status == "optimal"}
+    found: dict[str, dict[str, Gap]] = {}
+    for label, plan in plans.items():
+        found[label] = {}
+        for objective, optimum in optima.items():
+            cost = getattr(plan, objective)
+            if cost < optimum:
+                raise ValueError(
+                    f"plans[{describe(label)}] has {objective.replace('_', ' ')} {cost}, below "
+                    f"{optimum}, which another plan has as the proven optimum"
+                )
+            if plan.success and (plan.status, plan.objective) != ("optimal", objective):
+                found[label][objective] = Gap((cost - optimum) / optimum, optimum)
+    return found
+
+
+def check_plans(problem: object, plans: object) -> None:
+    """Refuse what is no mapping of labels to plans of the problem.
+
+    Raises
+    ------
+    ValueError
+        That names the argument, or the label of the plan.
+    """
+    if not isinstance(problem, Problem):
+        raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
+    if not isinstance(plans, Mapping) or not 1 <= len(plans) <= MAX_PLANS:
+        raise ValueError(
+            f"plans must be a mapping of 1 to {MAX_PLANS} labels to plans, got {describe(plans)}"
+        )
+    for label, plan in plans.items():
+        if not isinstance(label, str):
+            raise ValueError(f"plans must have strings as labels, got {describe(label)}")
+        if not isinstance(plan, Plan):
+            raise ValueError(
+                f"plans[{describe(label)}] must be a mapp_env.Plan, got {describe(plan)}"
+            )
+        own = plan.problem
+        same = own is None or (
+            own.grid == problem.grid and set(own.landmarks) == set(problem.landmarks)
+        )
+        if not same or len(plan.tours) != problem.n_agents:
+            raise ValueError(f"plans[{describe(label)}] is a plan of another problem")

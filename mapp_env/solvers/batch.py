@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.grid import Grid
+from mapp_env.grid import FAR, MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
-from mapp_env.solvers.distances import cell_distances
 from mapp_env.solvers.held_karp import route_costs, shortest_routes
+from mapp_env.solvers.solution import cell_distances, team_of
 from mapp_env.validation import check_choice, check_count, describe
 
 __all__ = ["MAX_BATCH_LANDMARKS", "Workspace", "optimal_costs", "solve_rows"]
@@ -20,11 +20,7 @@ __all__ = ["MAX_BATCH_LANDMARKS", "Workspace", "optimal_costs", "solve_rows"]
 MAX_BATCH_LANDMARKS = 12
 """Largest number of landmarks of each problem."""
 
-MAX_CELLS = 4096
-"""Distances are kept between so many cells at a time (64 MiB)."""
-
 CHUNK_WORK = 4_000_000  # between two chances to interrupt: some milliseconds
-FAR = np.int32(1 << 29)
 
 
 class Workspace(NamedTuple):
@@ -83,14 +79,13 @@ def optimal_costs(
     cells = _check_rows(grid, landmarks)
     n_problems, n_landmarks = cells.shape
     optimum = np.empty(n_problems, np.int32)
-    teams = 1 if objective == "total_distance" else min(n_agents, n_landmarks)
-    closed = objective != "cover_time"
+    teams, closed = team_of(objective, n_agents, n_landmarks)
     workspace = Workspace.of(n_landmarks)
     chunk = max(1, CHUNK_WORK // 3**n_landmarks)
     # Few enough rows that their cells' distances fit, unless those of all cells do.
-    together = (
-        max(1, n_problems) if grid.reachable.size < MAX_CELLS else (MAX_CELLS - 1) // n_landmarks
-    )
+    together = max(1, n_problems)
+    if grid.reachable.size >= MAX_ALL_PAIRS_CELLS:
+        together = (MAX_ALL_PAIRS_CELLS - 1) // n_landmarks
     for first in range(0, n_problems, together):
         part = cells[first : first + together]
         used = np.zeros(grid.n_cells, np.bool_)
@@ -100,10 +95,9 @@ def optimal_costs(
         places = np.empty(grid.n_cells, np.int32)
         places[nodes] = np.arange(len(nodes))
         rows = places[part]
-        answers = optimum[first : first + together]
         for start in range(0, len(part), chunk):
-            piece = slice(start, start + chunk)
-            solve_rows(distances, rows[piece], teams, closed, answers[piece], workspace)
+            piece = optimum[first + start : first + start + chunk][: len(part) - start]
+            solve_rows(distances, rows[start : start + chunk], teams, closed, piece, workspace)
     return optimum
 
 
@@ -113,11 +107,8 @@ def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
         rows = np.asarray(landmarks)
     except ValueError:  # ragged
         rows = np.empty(0)
-    if (
-        rows.ndim != 2
-        or rows.dtype.kind not in "iu"
-        or not 1 <= rows.shape[1] <= (MAX_BATCH_LANDMARKS)
-    ):
+    whole = rows.ndim == 2 and rows.dtype.kind in "iu"
+    if not whole or not 1 <= rows.shape[1] <= MAX_BATCH_LANDMARKS:
         raise ValueError(
             f"landmarks must be integers of shape (P, K) with K in 1..{MAX_BATCH_LANDMARKS}, got "
             f"{describe(landmarks) if rows.ndim == 0 else f'{rows.dtype} of shape {rows.shape}'}"
@@ -146,22 +137,10 @@ def solve_rows(
     optimum: NDArray[np.int32],
     workspace: Workspace,
 ) -> None:
-    """Fill in the optimum of each row.
+    """Fill in the ``optimum``, shape (p,), of each row of landmarks' nodes, shape (p, K).
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (S, S)
-        Between nodes; node 0 is the depot.
-    rows : ndarray of int32, shape (p, K)
-        The landmarks' nodes.
-    teams : int
-        Number of agents, at most K.
-    closed : bool
-        Whether tours are closed.
-    optimum : ndarray of int32, shape (p,)
-        The results.
-    workspace : Workspace
-        Of K landmarks.
+    ``distances``, shape (S, S), are between nodes; node 0 is the depot. ``teams``, at most K, and
+    ``closed`` are from :func:`~mapp_env.solvers.solution.team_of`.
     """
     between, routes, costs, worst = workspace
     n_landmarks = rows.shape[1]
@@ -180,14 +159,8 @@ def solve_rows(
 def least_worst(costs: NDArray[np.int32], teams: int, worst: NDArray[np.int32]) -> int:
     """Return the smallest possible cost of the costliest of so many sets that hold everything.
 
-    Parameters
-    ----------
-    costs : ndarray of int32, shape (2 ** K,)
-        What each set costs one agent.
-    teams : int
-        Number of agents.
-    worst : ndarray of int32, shape (2, 2 ** (K - 1))
-        Scratch space: the answer for fewer agents and each set without the highest landmark.
+    ``costs``, shape (2 ** K,), is what each set costs one agent; ``worst``, shape
+    (2, 2 ** (K - 1)), the answer for fewer agents and each set without the highest landmark.
     """
     half = worst.shape[1]
     if teams == 1:

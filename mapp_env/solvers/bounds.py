@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapp_env.compiled import kernel
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem
-from mapp_env.solvers.families import smallest_limit
+from mapp_env.solvers.exact import smallest_limit
 from mapp_env.solvers.held_karp import route_tables
-from mapp_env.solvers.spanning_trees import SCALE, ascend
+from mapp_env.solvers.solution import UNBOUNDED, team_of
 from mapp_env.validation import check_choice
 
 __all__ = ["lower_bound", "subset_bound", "tree_bound"]
@@ -17,25 +18,23 @@ __all__ = ["lower_bound", "subset_bound", "tree_bound"]
 SUBSET = 12
 """Landmarks that :func:`subset_bound` looks at: about a millisecond."""
 
+ROUNDS = 200
+SCALE = 1 << 10
+"""Penalties are whole multiples of 1 / SCALE of a step, so that a bound has no rounding error."""
+
 
 def lower_bound(problem: Problem, objective: str, distances: NDArray[np.int32]) -> int:
-    """Return a cost that no plan of a problem can beat.
+    """Return a cost that no plan of a problem can beat; up to 12 landmarks it is the optimum.
 
-    It is the larger of :func:`tree_bound` and :func:`subset_bound`; up to 12 landmarks it is the
-    optimum.
+    ``distances`` are from :func:`~mapp_env.solvers.solution.landmark_distances`.
 
-    Parameters
-    ----------
-    problem : Problem
-        The problem.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is bounded.
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        From :func:`~mapp_env.solvers.distances.landmark_distances`.
+    Raises
+    ------
+    ValueError
+        If the objective is unknown.
     """
     check_choice("objective", objective, OBJECTIVES)
-    closed = objective != "cover_time"
-    teams = 1 if objective == "total_distance" else min(problem.n_agents, len(distances) - 1)
+    teams, closed = team_of(objective, problem.n_agents, len(distances) - 1)
     return subset_bound(distances, teams, closed, tree_bound(distances, teams, closed))
 
 
@@ -52,29 +51,12 @@ def tree_bound(distances: NDArray[np.int32], teams: int, closed: bool) -> int:
       the depot at most N, again under node penalties; one agent walks at least an N-th of it.
 
     Closed tours on a grid have even length, so their bounds are rounded up to even numbers.
-
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Between the depot (node 0) and the landmarks.
-    teams : int
-        Number of agents.
-    closed : bool
-        Whether the way home counts.
     """
     n_nodes = len(distances)
     farthest = int(distances[0].max()) * (2 if closed else 1)
     if n_nodes == 2:
         return farthest
-    scaled = ascend(
-        distances,
-        closed,
-        teams,
-        np.zeros(n_nodes, np.int64),
-        np.empty(n_nodes, np.int64),
-        np.empty(n_nodes, np.int64),
-        np.empty(n_nodes, np.int64),
-    )
+    scaled = ascend(distances, closed, teams, *np.zeros((4, n_nodes), np.int64))
     spread = -(-int(scaled) // (SCALE * teams))
     if closed:
         spread += spread % 2
@@ -87,17 +69,6 @@ def subset_bound(distances: NDArray[np.int32], teams: int, closed: bool, low: in
     With landmarks left out a plan is a plan still: no optimum falls with a landmark more. The
     farthest from the depot comes first, then always the one for which the distance to the nearest
     chosen landmark and the distance to the depot have the largest sum.
-
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Between the depot (node 0) and the landmarks.
-    teams : int
-        Number of agents.
-    closed : bool
-        Whether the way home counts.
-    low : int
-        A lower bound of the whole problem.
     """
     home = distances[0]
     nodes = [0, int(home.argmax())]
@@ -108,3 +79,118 @@ def subset_bound(distances: NDArray[np.int32], teams: int, closed: bool, low: in
         np.minimum(nearest, distances[nodes[-1]], out=nearest)
     _, costs = route_tables(np.ascontiguousarray(distances[np.ix_(nodes, nodes)]), closed)
     return smallest_limit(costs, min(teams, len(nodes) - 1), low)
+
+
+# -- spanning trees ------------------------------------------------------
+
+# An agent's route is a tree, and so are the routes of a team together: a smallest spanning tree is
+# never longer. Penalties on nodes, which change the trees but no tour, raise the bound (Held and
+# Karp 1970, doi:10.1287/opre.18.6.1138).
+
+
+@kernel
+def ascend(
+    distances: NDArray[np.int32],
+    closed: bool,
+    n_agents: int,
+    penalties: NDArray[np.int64],
+    reach: NDArray[np.int64],
+    links: NDArray[np.int64],
+    degrees: NDArray[np.int64],
+) -> int:
+    """Raise node penalties by subgradient steps; return the best bound found, times ``SCALE``.
+
+    Parameters
+    ----------
+    distances : ndarray of int32, shape (n, n), n >= 3
+        Node 0 is the depot.
+    closed : bool
+        Bound one closed tour (1-trees: every degree is 2), or the open routes of a team (trees:
+        no degree above 2, the depot's not above ``n_agents``).
+    n_agents : int
+        Number of agents.
+    penalties, reach, links, degrees : ndarray of int64, shape (n,)
+        Zero on entry; the last three are scratch space.
+    """
+    n_nodes = distances.shape[0]
+    best = 0
+    stride = 0
+    for turn in range(ROUNDS):
+        weight = span(distances, closed, penalties, reach, links, degrees)
+        for node in range(n_nodes):
+            limit = 2 if closed or node > 0 else n_agents
+            weight -= limit * penalties[node]
+        best = max(best, weight)
+        if turn == 0:
+            stride = max(weight // (2 * n_nodes), 1)
+        step = max(stride * (ROUNDS - turn) // ROUNDS, 1)
+        for node in range(n_nodes):
+            limit = 2 if closed or node > 0 else n_agents
+            penalties[node] += step * (degrees[node] - limit)
+            # "At most" may only be punished where it is broken.
+            if not closed and penalties[node] < 0:
+                penalties[node] = 0
+    return best
+
+
+@kernel
+def span(
+    distances: NDArray[np.int32],
+    closed: bool,
+    penalties: NDArray[np.int64],
+    reach: NDArray[np.int64],
+    links: NDArray[np.int64],
+    degrees: NDArray[np.int64],
+) -> int:
+    """Return the weight of a smallest spanning tree (Prim) under penalties, and its degrees.
+
+    For a closed tour the tree spans the landmarks, and the depot joins it by its two best edges.
+    """
+    n_nodes = distances.shape[0]
+    root = 1 if closed else 0
+    total = 0
+    degrees[:] = 0
+    for node in range(root, n_nodes):
+        reach[node] = UNBOUNDED
+    reach[root] = 0
+    links[root] = root
+    for _ in range(root, n_nodes):
+        nearest = -1
+        least = UNBOUNDED
+        for node in range(root, n_nodes):
+            if reach[node] < least:
+                nearest = node
+                least = reach[node]
+        total += least
+        # Joined nodes are beyond UNBOUNDED.
+        reach[nearest] = 2 * UNBOUNDED
+        if nearest != root:
+            degrees[nearest] += 1
+            degrees[links[nearest]] += 1
+        for node in range(root, n_nodes):
+            weight = SCALE * distances[nearest, node] + penalties[nearest] + penalties[node]
+            if reach[node] <= UNBOUNDED and weight < reach[node]:
+                reach[node] = weight
+                links[node] = nearest
+    if closed:
+        first = UNBOUNDED
+        second = UNBOUNDED
+        for node in range(1, n_nodes):
+            weight = SCALE * distances[0, node] + penalties[0] + penalties[node]
+            if weight < first:
+                second = first
+                first = weight
+                links[0] = node
+            elif weight < second:
+                second = weight
+        total += first + second
+        degrees[0] = 2
+        for node in range(1, n_nodes):
+            weight = SCALE * distances[0, node] + penalties[0] + penalties[node]
+            # The two best edges, the second being the first of its weight.
+            if node == links[0]:
+                degrees[node] += 1
+            elif weight == second:
+                degrees[node] += 1
+                second = -UNBOUNDED
+    return total

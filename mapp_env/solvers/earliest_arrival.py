@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapp_env.solvers.solution import UNBOUNDED
+
 __all__ = ["NOBODY", "assign_landmarks"]
 
 NOBODY = -1
-NEVER = np.iinfo(np.int64).max
 
 
 def assign_landmarks(
@@ -53,7 +54,7 @@ def assign_landmarks(
     while left.any():
         rows = np.flatnonzero(left.any(axis=1))
         arrivals = steps[rows, :, None] + distances[at[rows, :, None], landmarks[rows, None, :]]
-        arrivals = np.where(left[rows, None, :], arrivals, NEVER).reshape(len(rows), -1)
+        arrivals = np.where(left[rows, None, :], arrivals, UNBOUNDED).reshape(len(rows), -1)
         earliest = arrivals.argmin(axis=1)
         agent, landmark = np.divmod(earliest, left.shape[1])
         steps[rows, agent] = arrivals[np.arange(len(rows)), earliest]

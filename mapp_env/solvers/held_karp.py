@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.grid import FAR
 
-__all__ = ["FAR", "route_costs", "route_tables", "shortest_routes", "tours_within", "trace_route"]
-
-FAR = 1 << 29
-"""More than any route, and twice it is still an int32."""
+__all__ = ["route_costs", "route_tables", "shortest_routes", "tours_within", "trace_route"]
 
 
 def route_tables(
@@ -22,17 +20,7 @@ def route_tables(
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return, for each set, the steps to each of its landmarks as the last, and its cost.
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Symmetric; node 0 is the depot.
-    closed : bool
-        Whether the way back to the depot counts.
-
-    Returns
-    -------
-    routes, costs : ndarray of int32, shape (2 ** K, K) and (2 ** K,)
-        From :func:`shortest_routes` and :func:`route_costs`.
+    As :func:`shortest_routes` and :func:`route_costs` fill them in, (2 ** K, K) and (2 ** K,).
     """
     n_landmarks = len(distances) - 1
     routes = np.empty((1 << n_landmarks, n_landmarks), np.int32)
@@ -67,7 +55,7 @@ def shortest_routes(distances: NDArray[np.int32], routes: NDArray[np.int32]) -> 
                 # loop takes eight at a time.
                 shorter = routes[members ^ bit]
                 steps = distances[last + 1]
-                least = np.int32(FAR)
+                least = FAR
                 for before in range(n_landmarks):
                     least = min(least, np.int32(shorter[before] + steps[before + 1]))
                 routes[members, last] = least
@@ -83,7 +71,7 @@ def route_costs(
     """Fill in, for each set, the steps of one agent's shortest route, or closed tour, (2 ** K,)."""
     costs[0] = 0
     for members in range(1, costs.shape[0]):
-        least = np.int32(FAR)
+        least = FAR
         for last in range(routes.shape[1]):
             steps = routes[members, last]
             if closed:
@@ -106,7 +94,7 @@ def tours_within(
     """
     tours[0] = 0
     for members in range(1, tours.shape[0]):
-        least = np.int32(FAR)
+        least = FAR
         for last in range(routes.shape[1]):
             steps = routes[members, last]
             tour = steps + distances[0, last + 1]

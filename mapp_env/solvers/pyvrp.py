@@ -11,22 +11,24 @@ It comes with the extra ``pyvrp`` and is imported when a problem is solved.
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.distances import landmark_distances
-from mapp_env.solvers.solution import Routes, Solution, solution_of
-from mapp_env.validation import check_choice
+from mapp_env.solvers.solution import (
+    UNBOUNDED,
+    Routes,
+    Solution,
+    landmark_distances,
+    solution_of,
+)
 
-__all__ = ["DEFAULT_SECONDS", "search_routes", "solve_pyvrp"]
+__all__ = ["DEFAULT_SECONDS", "import_pyvrp", "solve_pyvrp"]
 
 DEFAULT_SECONDS = 2.0
 """Time limit if none is given."""
@@ -35,8 +37,6 @@ DEFAULT_SECONDS = 2.0
 # with a tight limit no way through plans that break it.
 MAX_PENALTY = 100.0
 PENALTY_ROUNDS = 50
-
-FAR = 1 << 60
 
 
 def solve_pyvrp(
@@ -51,16 +51,12 @@ def solve_pyvrp(
 
     Parameters
     ----------
-    problem : Problem
-        Of any size.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is minimised.
+    problem, objective, on_better
+        As for :func:`~mapp_env.solvers.search.solve_search`.
     time_limit : float, optional
         Seconds; by default 2. PyVRP builds at least one plan, however few they are.
     seed : int
         Of the search, which is bounded by time, so the answer depends on the machine as well.
-    on_better : callable, optional
-        Called with each smaller cost.
 
     Returns
     -------
@@ -74,71 +70,35 @@ def solve_pyvrp(
     ValueError
         If ``objective`` is unknown.
     """
-    check_choice("objective", objective, OBJECTIVES)
-    _import_pyvrp()
-    deadline = time.perf_counter() + (DEFAULT_SECONDS if time_limit is None else time_limit)
+    pyvrp = import_pyvrp()
+    deadline = clock() + (DEFAULT_SECONDS if time_limit is None else time_limit)
     distances = landmark_distances(problem)
     bound = lower_bound(problem, objective, distances)
-    cost, nodes = search_routes(
-        distances, problem.n_agents, objective, deadline, seed, bound, on_better
-    )
-    return solution_of(problem, nodes, cost, bound)
-
-
-def search_routes(
-    distances: NDArray[np.int32],
-    n_agents: int,
-    objective: str,
-    deadline: float,
-    seed: int = 0,
-    bound: int = 0,
-    on_better: Callable[[int], None] | None = None,
-) -> tuple[int, Routes]:
-    """Return the cost and the routes, as nodes 1 to K, of the agents that have one.
-
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Between the depot (node 0) and the landmarks.
-    n_agents : int
-        Number of agents.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is minimised.
-    deadline : float
-        When to stop, on ``time.perf_counter()``'s clock.
-    seed : int
-        Of the search.
-    bound : int
-        A cost that is good enough to stop.
-    on_better : callable, optional
-        Called with each smaller cost.
-    """
-    pyvrp = _import_pyvrp()
+    total = objective == "total_distance"
     arcs = distances.astype(np.int64)
     if objective == "cover_time":
         arcs[:, 0] = 0
     word = int(np.random.SeedSequence(seed).generate_state(1)[0])
     penalty = pyvrp.PenaltyParams(max_penalty=MAX_PENALTY, solutions_between_updates=PENALTY_ROUNDS)
     params = pyvrp.SolveParams(penalty=penalty)
-    total = objective == "total_distance"
-    best = FAR
+    best = UNBOUNDED
     routes: Routes = ()
     while True:
-        limit = {}
-        if routes:
-            # Closed tours on a grid have even length.
-            limit = {"max_distance": best - (1 if objective == "cover_time" else 2)}
+        # Closed tours on a grid have even length.
+        step = 1 if objective == "cover_time" else 2
+        limit = {"max_distance": best - step} if routes else {}
+        # No team walks less than one agent, by the triangle inequality.
+        vehicles = pyvrp.VehicleType(1 if total else problem.n_agents, **limit)
         data = pyvrp.ProblemData(
             locations=[pyvrp.Location(0, 0) for _ in arcs],
             clients=[pyvrp.Client(node) for node in range(1, len(arcs))],
             depots=[pyvrp.Depot(0)],
-            # No team walks less than one agent, by the triangle inequality.
-            vehicle_types=[pyvrp.VehicleType(1 if total else n_agents, **limit)],
+            vehicle_types=[vehicles],
             distance_matrices=[arcs],
             duration_matrices=[np.zeros_like(arcs)],
         )
         # Where the longest route counts, any plan within the limit will do.
-        stop = _Stop(deadline, bound, on_better) if total else _Stop(deadline, FAR - 1, None)
+        stop = _Stop(deadline, bound, on_better) if total else _Stop(deadline, UNBOUNDED - 1, None)
         with warnings.catch_warnings():
             # It says that no plan is in sight, and that is how this ends.
             warnings.simplefilter("ignore", pyvrp.exceptions.PenaltyBoundWarning)
@@ -154,15 +114,15 @@ def search_routes(
         )
         if on_better is not None and not total:
             on_better(best)
-        if total or best <= bound or time.perf_counter() >= deadline:
+        if total or best <= bound or clock() >= deadline:
             break
     if not routes:
         raise RuntimeError("PyVRP found no plan, though nothing limits one")
-    return best, routes
+    return solution_of(problem, routes, best, bound)
 
 
 class _Stop:
-    """Tells PyVRP when to stop: at a time, or at a cost (which is far above FAR for no plan).
+    """Tells PyVRP when to stop: at a time, or at a cost (which is far above any no plan).
 
     PyVRP asks in each iteration, so this is also who sees costs fall.
     """
@@ -171,17 +131,17 @@ class _Stop:
         self._deadline = deadline
         self._cost = cost
         self._on_better = on_better
-        self._best = FAR
+        self._best = UNBOUNDED
 
     def __call__(self, best_cost: float) -> bool:
         if best_cost < self._best:
             self._best = int(best_cost)
             if self._on_better is not None:
                 self._on_better(self._best)
-        return best_cost <= self._cost or time.perf_counter() >= self._deadline
+        return best_cost <= self._cost or clock() >= self._deadline
 
 
-def _import_pyvrp() -> Any:
+def import_pyvrp() -> Any:
     """Return the package, or say how to get it."""
     try:
         import pyvrp

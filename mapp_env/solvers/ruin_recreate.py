@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.solvers.solution import UNBOUNDED
 
 __all__ = ["Layout", "Scratch", "Team", "improve"]
 
@@ -33,7 +34,6 @@ LONGEST_PERCENT = 75
 MEAN_BLINK = 100  # places tried between two that are skipped
 
 LOW_32_BITS = 0xFFFFFFFF
-FAR = 1 << 60
 
 # Places in `Search.memory`.
 WORD, COST, BEST, BEST_TOTAL, DONE, IMPROVED, CYCLE_END, CYCLE = range(8)
@@ -224,9 +224,10 @@ def recreate(
     blink = 1 + draw(memory, 2 * MEAN_BLINK)
     for index in range(count):
         node = scratch.removed[index]
-        least = FAR
+        least = UNBOUNDED
         chosen = 0
         chosen_place = 0
+        chosen_detour = 0
         tried_empty = False
         for agent in range(n_routes):
             size = team.sizes[agent]
@@ -244,7 +245,7 @@ def recreate(
                 else:
                     detour += layout.back[node] - layout.back[before]
                 blink -= 1
-                if blink <= 0 and least < FAR:
+                if blink <= 0 and least < UNBOUNDED:
                     blink = 1 + draw(memory, 2 * MEAN_BLINK)
                     continue
                 excess = max(team.lengths[agent] + detour - top, 0)
@@ -253,20 +254,13 @@ def recreate(
                     least = cost
                     chosen = agent
                     chosen_place = place
+                    chosen_detour = detour
         route = team.routes[chosen]
-        size = team.sizes[chosen]
-        before = route[chosen_place - 1] if chosen_place > 0 else 0
-        detour = distances[node, before]
-        if chosen_place < size:
-            after = route[chosen_place]
-            detour += distances[node, after] - distances[before, after]
-        else:
-            detour += layout.back[node] - layout.back[before]
-        for place in range(size, chosen_place, -1):
+        for place in range(team.sizes[chosen], chosen_place, -1):
             route[place] = route[place - 1]
         route[chosen_place] = node
-        team.sizes[chosen] = size + 1
-        team.lengths[chosen] += detour
+        team.sizes[chosen] += 1
+        team.lengths[chosen] += chosen_detour
         top = max(top, team.lengths[chosen])
         scratch.holder[node] = chosen
         scratch.touched[chosen] = True

@@ -8,33 +8,34 @@ Nothing but the seed and the number of iterations decides what is found.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.grid import Grid
-from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.ruin_recreate import (
     BEST,
     BEST_TOTAL,
     COST,
     CYCLE,
     DONE,
-    FAR,
     WORD,
     Layout,
     Scratch,
     Team,
     improve,
 )
-from mapp_env.solvers.solution import Routes, Solution, solution_of
-from mapp_env.validation import check_choice, check_count
+from mapp_env.solvers.solution import (
+    UNBOUNDED,
+    Routes,
+    Solution,
+    landmark_distances,
+    solution_of,
+)
+from mapp_env.validation import check_count
 
 __all__ = ["DEFAULT_ITERATIONS", "Search", "solve_search"]
 
@@ -89,44 +90,24 @@ def solve_search(
     ValueError
         If ``objective`` is unknown or ``iterations`` not a positive integer.
     """
-    check_choice("objective", objective, OBJECTIVES)
     if iterations is None:
         iterations = DEFAULT_ITERATIONS if time_limit is None else MAX_ITERATIONS
     check_count("iterations", iterations, 1, MAX_ITERATIONS)
-    _warm_up()
-    return _solve(problem, objective, time_limit, seed, iterations, on_better)
-
-
-def _solve(
-    problem: Problem,
-    objective: str,
-    time_limit: float | None,
-    seed: int,
-    iterations: int,
-    on_better: Callable[[int], None] | None,
-) -> Solution:
-    deadline = math.inf if time_limit is None else time.perf_counter() + time_limit
+    deadline = math.inf if time_limit is None else clock() + time_limit
     distances = landmark_distances(problem)
     bound = lower_bound(problem, objective, distances)
     search = Search(distances, problem.n_agents, objective, seed)
-    best = FAR
+    best = UNBOUNDED
     chunk = 1
     while search.iterations < iterations:
         going = search.run(min(chunk, iterations - search.iterations), bound)
         if search.cost < best and on_better is not None:
             on_better(search.cost)
         best = search.cost
-        if not going or time.perf_counter() >= deadline:
+        if not going or clock() >= deadline:
             break
         chunk = CHUNK
     return solution_of(problem, search.routes(), search.cost, bound)
-
-
-@cache
-def _warm_up() -> None:
-    """Load or compile all kernels, so that this is no part of anybody's time limit."""
-    corridor = Problem(Grid(np.zeros((1, 4), np.bool_)), (2, 3), 1)
-    _solve(corridor, "cover_time", None, 0, 1, None)
 
 
 class Search:
@@ -158,9 +139,14 @@ class Search:
             (np.argsort(distances[:, 1:], axis=1, kind="stable") + 1).astype(np.int32),
             0 if objective == "total_distance" else 2 * n_agents,
         )
-        self._now = _empty_team(n_routes, n_landmarks)
-        self._trial = _empty_team(n_routes, n_landmarks)
-        self._best = _empty_team(n_routes, n_landmarks)
+        self._teams = [
+            Team(
+                np.zeros((n_routes, n_landmarks), np.int32),
+                np.zeros(n_routes, np.int64),
+                np.zeros(n_routes, np.int64),
+            )
+            for _ in range(3)
+        ]
         self._scratch = Scratch(
             np.full(n_landmarks + 1, -1),
             np.zeros(n_landmarks, np.int64),
@@ -169,41 +155,21 @@ class Search:
         )
         self._memory = np.zeros(8, np.int64)
         self._memory[WORD] = np.random.SeedSequence(seed).generate_state(1)[0]
-        self._memory[[COST, BEST, BEST_TOTAL]] = FAR
+        self._memory[[COST, BEST, BEST_TOTAL]] = UNBOUNDED
         self._memory[CYCLE] = FIRST_CYCLE
         leg = max(float(distances[1:, 1:].mean()) / math.sqrt(n_landmarks), 0.5)
         self._heat = np.array([COLD * leg, 1.0, HOT * leg, COLD * leg])
 
     def run(self, iterations: int, bound: int = -1) -> bool:
-        """Carry out some iterations.
+        """Carry out so many iterations at most; return whether more could do better.
 
-        Parameters
-        ----------
-        iterations : int
-            How many, at most.
-        bound : int
-            A cost that cannot be beaten: once it is reached, only the total distance is left to
-            improve.
-
-        Returns
-        -------
-        bool
-            Whether more iterations could do better: False once ``bound`` is reached and the total
-            distance has not fallen for a while.
+        ``bound`` is a cost that cannot be beaten: once it is reached, only the total distance is
+        left to improve, and no more is to be done when that has not fallen for a while.
         """
-        return bool(
-            improve(
-                iterations,
-                bound,
-                self._layout,
-                self._now,
-                self._trial,
-                self._best,
-                self._scratch,
-                self._memory,
-                self._heat,
-            )
+        going = improve(
+            iterations, bound, self._layout, *self._teams, self._scratch, self._memory, self._heat
         )
+        return bool(going)
 
     @property
     def cost(self) -> int:
@@ -217,15 +183,6 @@ class Search:
 
     def routes(self) -> Routes:
         """Return the best routes so far, as nodes 1 to K, for at most as many as agents."""
-        return tuple(
-            tuple(route[:size].tolist())
-            for route, size in zip(self._best.routes, self._best.sizes, strict=True)
-        )
-
-
-def _empty_team(n_routes: int, n_landmarks: int) -> Team:
-    return Team(
-        np.zeros((n_routes, n_landmarks), np.int32),
-        np.zeros(n_routes, np.int64),
-        np.zeros(n_routes, np.int64),
-    )
+        best = self._teams[-1]
+        pairs = zip(best.routes, best.sizes, strict=True)
+        return tuple(tuple(route[:size].tolist()) for route, size in pairs)

@@ -1,14 +1,30 @@
-"""What every solver hands back: routes in landmarks and what it has proven about their cost."""
+"""What a solver is given, distances, and what it hands back: routes, and what is proven of them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.grid import Grid, fill_distances
 from mapp_env.problem import Problem
 
-__all__ = ["Routes", "Solution", "Solver", "solution_of"]
+__all__ = [
+    "UNBOUNDED",
+    "Routes",
+    "Solution",
+    "Solver",
+    "cell_distances",
+    "landmark_distances",
+    "solution_of",
+    "team_of",
+]
+
+UNBOUNDED = 1 << 60
+"""More than any cost, weighted or scaled, and twice it is still an int64."""
 
 Routes = tuple[tuple[int, ...], ...]
 """For each agent the landmark cells that it visits, in order; an agent may have none."""
@@ -61,3 +77,42 @@ class Solver(Protocol):
     ) -> Solution:
         """Return routes for a problem, short in ``objective``."""
         ...
+
+
+def team_of(objective: str, n_agents: int, n_landmarks: int) -> tuple[int, bool]:
+    """Return how many agents are of use in an objective, and whether their ways home count.
+
+    No team walks less in all than one agent, by the triangle inequality.
+    """
+    teams = 1 if objective == "total_distance" else min(n_agents, n_landmarks)
+    return teams, objective != "cover_time"
+
+
+def landmark_distances(problem: Problem) -> NDArray[np.int32]:
+    """Return the shortest-path steps between the depot and the landmarks.
+
+    One breadth-first search a cell: never all pairs of a grid's cells.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its landmarks keep their order.
+
+    Returns
+    -------
+    ndarray of int32, shape (K + 1, K + 1)
+        Line and column 0 belong to the depot, ``k + 1`` to landmark ``k``. Symmetric.
+    """
+    cells = np.array([problem.grid.depot, *problem.landmarks], np.int64)
+    return cell_distances(problem.grid, cells)
+
+
+def cell_distances(grid: Grid, cells: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
+    """Return the shortest-path steps between cells that can all be reached, shape (S, S) int32."""
+    distances = np.empty((len(cells), len(cells)), np.int32)
+    field = np.empty(grid.n_cells, np.int32)
+    queue = np.empty(grid.n_cells, np.int32)
+    for line, cell in zip(distances, cells, strict=True):
+        fill_distances(grid.moves, cell, field, queue)
+        line[:] = field[cells]
+    return distances

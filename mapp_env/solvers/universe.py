@@ -13,7 +13,7 @@ from mapp_env.grid import Grid
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
 from mapp_env.solvers.batch import CHUNK_WORK, MAX_BATCH_LANDMARKS, Workspace, solve_rows
-from mapp_env.solvers.distances import cell_distances
+from mapp_env.solvers.solution import cell_distances, team_of
 from mapp_env.validation import check_choice, check_count
 
 __all__ = ["MAX_UNIVERSE_PROBLEMS", "MAX_UNIVERSE_WORK", "solve_universe"]
@@ -74,12 +74,11 @@ def solve_universe(
             f"3 ** n_landmarks: use sample_problems() and solve()"
         )
     cell_type = np.int16 if grid.n_cells <= np.iinfo(np.int16).max else np.int32
-    closed = objective != "cover_time"
+    teams, closed = team_of(objective, n_agents, n_landmarks)
     if n_landmarks == 1:
         # No distances between landmarks: a large grid would have too many.
         return cells.astype(cell_type)[:, None], grid.home[cells] * (2 if closed else 1)
     distances = cell_distances(grid, np.concatenate(([grid.depot], cells)))
-    teams = 1 if objective == "total_distance" else min(n_agents, n_landmarks)
     landmarks = np.empty((n_problems, n_landmarks), cell_type)
     optimum = np.empty(n_problems, np.int32)
     workspace = Workspace.of(n_landmarks)
@@ -96,16 +95,9 @@ def solve_universe(
 
 @kernel
 def list_sets(chosen: NDArray[np.int64], n_items: int, sets: NDArray[np.int32]) -> None:
-    """Write sets of items in lexicographic order, from ``chosen`` on.
+    """Write sets of items, 0 to ``n_items - 1``, in lexicographic order: ``sets``, shape (p, K).
 
-    Parameters
-    ----------
-    chosen : ndarray of int64, shape (K,)
-        The first set, ascending; left as the one after the last, if there is one.
-    n_items : int
-        Items are 0 to ``n_items - 1``.
-    sets : ndarray of int32, shape (p, K)
-        The result.
+    ``chosen``, shape (K,), is the first, ascending; left as the one after the last, if any.
     """
     n_chosen = chosen.shape[0]
     last = n_items - n_chosen

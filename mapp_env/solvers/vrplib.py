@@ -6,7 +6,7 @@ import os
 
 from mapp_env.files import write_text
 from mapp_env.problem import Problem
-from mapp_env.solvers.distances import landmark_distances
+from mapp_env.solvers.solution import landmark_distances
 
 __all__ = ["save_vrplib"]
 

@@ -21,6 +21,7 @@ LAYERS: tuple[str, ...] = (
     "mapp_env.validation",
     "mapp_env.compiled",
     "mapp_env.files",
+    "mapp_env.records",
     "mapp_env.map_format",
     "mapp_env.grid",
     "mapp_env.grids",

@@ -22,17 +22,16 @@ import mapp_env
 from mapp_env import FileError, Grid, Plan, Problem, make_grid, replay, solve
 from mapp_env.commands import main
 from mapp_env.files import (
-    MAX_PLAN_BYTES,
-    MAX_PROBLEM_BYTES,
     check_writable,
     read_bytes,
     remove_unfinished,
     write_bytes,
     write_text,
 )
+from mapp_env.records import MAX_PLAN_BYTES, MAX_PROBLEM_BYTES
 from mapp_env.rendering import compare_plans, save_animation
 from mapp_env.solvers import save_vrplib
-from mapp_env.solvers.distances import landmark_distances
+from mapp_env.solvers.solution import landmark_distances
 
 # With claims at step 1 and on cell 0, which Python takes for True and False.
 PROBLEM = Problem(make_grid(), (48, 0, 6, 25), 2, max_cycles=40)

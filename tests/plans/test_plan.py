@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapp_env import Grid, Plan, Problem, make_grid, replay, sample_problems, solve
-from mapp_env.plans.walking import walk_tours
+from mapp_env.plans.tours import walk_tours
 
 LINE = Problem(Grid.from_text("#D...#"), (2, 4), 2)  # cells 1 to 4 are free
 
@@ -197,20 +197,20 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "one agent": ({"tours": TOURS[:1]}, "has 1 tours and 2 lists of claims"),
     "three agents": ({"tours": (*TOURS, ())}, "has 3 tours"),
     "three claimers": ({"claims": (*PLAN.claims, ())}, "3 lists of claims"),
-    "misses a landmark": ({"tours": (TOURS[0], ()), "claims": ((0,), ())}, "landmark on cell 2"),
-    "claims twice": ({"claims": ((0,), (0,))}, "each once"),
-    "claims a free cell": ({"claims": ((0,), (2, 1))}, "must be landmarks"),
-    "claims without a tour": ({"tours": (TOURS[0], ())}, "agent 1 has 1 claims"),
+    "misses a landmark": ({"tours": (TOURS[0], ()), "claims": ((0,), ())}, "claims is stated"),
+    "claims twice": ({"claims": ((0,), (0,))}, "claims is stated"),
+    "claims a free cell": ({"claims": ((0,), (2, 1))}, "claims is stated"),
+    "claims without a tour": ({"tours": (TOURS[0], ())}, "tours is stated"),
     "a tour without claims": (
         {"claims": ((0,), ()), "cover_time": math.inf, "makespan": math.inf},
-        "agent 1 has 0 claims",
+        "cover_time is stated as inf",
     ),
-    "does not visit": ({"tours": (TOURS[1], TOURS[1])}, "does not visit its claims"),
+    "does not visit": ({"tours": (TOURS[1], TOURS[1])}, "tours is stated"),
     "claims in another order": (
         {"tours": ((4, 3, 0, 1, 2, 1, 4), ()), "claims": ((2, 0), ())},
-        "does not visit its claims in their order",
+        "claims is stated",
     ),
-    "detour home": ({"tours": ((4, 3, 0, 3, 4, 3, 4), TOURS[1])}, "shortest path home"),
+    "detour home": ({"tours": ((4, 3, 0, 3, 4, 3, 4), TOURS[1])}, "tours is stated"),
     "other way out": ({"tours": ((4, 1, 0, 1, 4), TOURS[1])}, "tours is stated"),
     "swapped claims": ({"claims": PLAN.claims[::-1], "tours": PLAN.tours[::-1]}, "claims is"),
     "cover time": ({"cover_time": 1}, "cover_time is stated as 1, the rules give 2"),

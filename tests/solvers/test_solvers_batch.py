@@ -7,7 +7,7 @@ import pytest
 
 import mapp_env
 from mapp_env import Grid, Problem, solve
-from mapp_env.solvers import batch, distances, optimal_costs, solve_universe
+from mapp_env.solvers import batch, optimal_costs, solution, solve_universe
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 PAPER = mapp_env.make_grid()
@@ -49,12 +49,12 @@ def test_parts_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     landmarks = draw(PAPER, 100, 4, seed=3)
     whole = optimal_costs(PAPER, landmarks)
     monkeypatch.setattr(batch, "CHUNK_WORK", 3 * 3**4)
-    monkeypatch.setattr(batch, "MAX_CELLS", 20)
+    monkeypatch.setattr(batch, "MAX_ALL_PAIRS_CELLS", 20)
     sizes = []
 
     def cell_distances(grid: Grid, cells: np.ndarray) -> np.ndarray:
         sizes.append(len(cells))
-        return distances.cell_distances(grid, cells)
+        return solution.cell_distances(grid, cells)
 
     monkeypatch.setattr(batch, "cell_distances", cell_distances)
     assert (optimal_costs(PAPER, landmarks) == whole).all()

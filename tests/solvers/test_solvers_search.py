@@ -8,7 +8,6 @@ import itertools
 import os
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,12 +16,11 @@ from mapp_env import Grid, Problem, make_grid, sample_problems, solve
 from mapp_env.solvers import _plan_of
 from mapp_env.solvers import search as search_module
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.distances import landmark_distances
 from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
 from mapp_env.solvers.ruin_recreate import recreate
 from mapp_env.solvers.search import Search, solve_search
-from mapp_env.solvers.solution import Solution, solution_of
+from mapp_env.solvers.solution import Solution, landmark_distances, solution_of
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 needs_pyvrp = pytest.mark.skipif(
@@ -190,7 +188,6 @@ def test_search_keeps_to_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = generated_problem("random", 64, 60, 3, 3)
     solve_search(problem, "cover_time", iterations=1)  # loads the kernels
     times = itertools.count(5.0)
-    clock = SimpleNamespace(perf_counter=lambda: next(times))
     asked, run = [], Search.run
 
     def watched(search: Search, iterations: int, bound: int) -> bool:
@@ -198,7 +195,7 @@ def test_search_keeps_to_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
         return run(search, iterations, bound)
 
     monkeypatch.setattr(Search, "run", watched)
-    monkeypatch.setattr(search_module, "time", clock)
+    monkeypatch.setattr(search_module, "clock", lambda: next(times))
     assert not solve_search(problem, "cover_time", time_limit=6.0).optimal
     assert next(times) == 12.0  # it began at 5 and was told at 11 that it was over
     assert len(asked) == 6

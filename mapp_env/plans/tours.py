@@ -1,4 +1,4 @@
-"""From tours to joint actions: how a team walks its tours so that the rules see nothing else."""
+"""Tours as cells, moves and joint actions, and how a team walks them by the rules."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from mapp_env.engine.rules import WAIT
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
+from mapp_env.validation import as_integer, describe
 
-__all__ = ["moves_of", "tour_of", "tour_through", "walk_tours"]
+__all__ = ["check_tours", "moves_of", "tour_of", "tour_through", "walk_tours"]
 
 
 def tour_through(grid: Grid, landmarks: Iterable[int]) -> tuple[int, ...]:
@@ -105,3 +106,43 @@ def _idle_actions(
                 to_and_fro = [action, back] * (end - step)
                 return [WAIT] * (step - start) + to_and_fro[: end - step]
     return [WAIT] * (end - start)
+
+
+def check_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> None:
+    """Check that each tour is a closed walk from the depot, or empty.
+
+    Raises
+    ------
+    ValueError
+        If one enters a wall, does not start and end at the depot, jumps or stands still.
+    """
+    grid = problem.grid
+    for agent, tour in enumerate(tours):
+        if not tour:
+            continue
+        cells = _as_cells(grid.n_cells, f"plan: tours[{agent}]: cell", tour)
+        for cell in cells[grid.walls.ravel()[cells]]:
+            raise ValueError(f"plan: tours[{agent}] enters cell {cell}, which is a wall")
+        if tour[0] != grid.depot or tour[-1] != grid.depot:
+            raise ValueError(
+                f"plan: tours[{agent}] must start and end at the depot, cell {grid.depot}; "
+                f"it goes from {tour[0]} to {tour[-1]}"
+            )
+        before, after = cells[:-1], cells[1:]
+        steps = (grid.moves[before] == after[:, None]).any(axis=1) & (before != after)
+        for place in np.flatnonzero(~steps):
+            raise ValueError(
+                f"plan: tours[{agent}] jumps from cell {before[place]} to {after[place]}"
+            )
+
+
+def _as_cells(n_cells: int, name: str, tour: Sequence[int]) -> NDArray[np.int64]:
+    """Return a tour as an array; tours may be long."""
+    try:
+        cells = np.asarray(tour)
+    except ValueError:
+        cells = np.array(None)  # ragged
+    if cells.ndim == 1 and cells.dtype.kind in "iu" and 0 <= cells.min() <= cells.max() < n_cells:
+        return cells.astype(np.int64)
+    wrong = next((cell for cell in tour if as_integer(cell) not in range(n_cells)), tour)
+    raise ValueError(f"{name} must be a cell in 0..{n_cells - 1}, got {describe(wrong)}")
