@@ -96,10 +96,10 @@ def observe_rows(
     masks: NDArray[np.int8],
     world: Packed,
 ) -> None:
-    """Look at some rows: ``views`` (M, V, F) and ``masks`` (M, N, A) of ``indices`` (M,)."""
+    """Look at the rows of ``indices``, (M,): theirs in ``views`` (B, V, F), ``masks`` (B, N, A)."""
     common = World(*world)
-    for place, index in enumerate(indices):
-        observe_row(rows[index], world_at(common, index), views[place], masks[place])
+    for index in indices:
+        observe_row(rows[index], world_at(common, index), views[index], masks[index])
 
 
 @kernel

@@ -165,15 +165,18 @@ class Rows:
             self.extend_trails(np.flatnonzero(~skip))
         return found
 
-    def observe(
-        self, indices: NDArray[np.int64] | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
-        """Return fresh views, shape (M, V, F), and masks, shape (M, N, A), of some or all rows."""
-        indices = self._every_row if indices is None else indices
-        views = np.empty((len(indices), *self.views_shape), np.float32)
-        masks = np.empty((len(indices), *self.masks_shape), np.int8)
-        observe_rows(self.array, indices, views, masks, self.world)
+    def observe(self) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+        """Return fresh views, shape (B, V, F), and masks, shape (B, N, A), of all rows."""
+        views = np.empty((self.n_rows, *self.views_shape), np.float32)
+        masks = np.empty((self.n_rows, *self.masks_shape), np.int8)
+        self.observe_again(self._every_row, views, masks)
         return views, masks
+
+    def observe_again(
+        self, indices: NDArray[np.int64], views: NDArray[np.float32], masks: NDArray[np.int8]
+    ) -> None:
+        """Write the views and masks of some rows, shape (M,), among those of all."""
+        observe_rows(self.array, indices, views, masks, self.world)
 
     def measure(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return cover time, makespan and total distance (R8), inf if unsolved, shape (M, 3)."""

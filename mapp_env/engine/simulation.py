@@ -17,6 +17,7 @@ from mapp_env.problem import Problem
 __all__ = ["Simulation", "metrics_of"]
 
 FIRST_ROW = np.zeros(1, np.int64)
+VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # to make them of types takes longer
 
 
 class Simulation:
@@ -92,8 +93,8 @@ class Simulation:
         ValueError
             If an action is not valid; nothing has moved then.
         """
-        views = np.empty(self._views_shape, np.float32)
-        masks = np.empty(self._masks_shape, np.int8)
+        views = np.empty(self._views_shape, VIEWS)
+        masks = np.empty(self._masks_shape, MASKS)
         reward, terminated, truncated = step_and_observe(
             self._row, actions, self._limit, views, masks, self._world
         )

@@ -24,6 +24,7 @@ __all__ = [
     "COL",
     "FAR",
     "HOME",
+    "MASK",
     "NO_DISTANCES",
     "N_ACTIONS",
     "ROW",
@@ -44,7 +45,7 @@ __all__ = [
 
 N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
 WAIT = 4
-ROW, COL, HOME, WALL = 5, 6, 7, 8  # columns of a table, after the five moves
+ROW, COL, HOME, WALL, MASK = 5, 6, 7, 8, 9  # columns of a table, after the five moves
 
 # Where the distances of a row's landmarks stand: from this line of `distances` on, or
 ALL_PAIRS = -1  # in `distances`, in the line of each landmark's cell
@@ -69,7 +70,7 @@ class World(NamedTuple):
     n_landmarks: int  # K
     reward: int  # a Reward
     observation: int  # an Observation
-    table: NDArray[np.int32]  # (C, 9), from cell_table
+    table: NDArray[np.int32]  # (C, 10), from cell_table
     distances: NDArray[np.int32]  # (S, C), from sources to cells: the reward's
     first_field: int  # line of the first landmark, ALL_PAIRS or BY_COORDINATES
     view_distances: NDArray[np.int32]  # (S, C), the observation's
@@ -166,14 +167,16 @@ def path_distances(grid: Grid, fields: NDArray[np.int32]) -> tuple[NDArray[np.in
 
 
 def cell_table(grid: Grid) -> NDArray[np.int32]:
-    """Return the grid as the kernels read it, shape (C, 9) int32, one line a cell.
+    """Return the grid as the kernels read it, shape (C, 10) int32, one line a cell.
 
-    ``[ next cell for left, right, up, down, wait | row, col | steps home | 1 for a wall ]``, so
-    that borders and walls vanish from the rules.
+    ``[ next cell for left, right, up, down, wait | row, col | steps home | 1 for a wall | mask ]``,
+    so that borders and walls vanish from the rules. The mask is four int8 in one word: 0 for a move
+    that bumps, else 1.
     """
     cells = np.arange(grid.n_cells)
     row, col = np.divmod(cells, grid.cols)
-    columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel()]
+    mask = (grid.moves != cells[:, None]).view(np.int32)
+    columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel(), mask]
     table = np.column_stack(columns).astype(np.int32)
     table.flags.writeable = False
     return table

@@ -283,14 +283,14 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self._ended = terminations | truncations
         ended = np.flatnonzero(self._ended)
         restarted = mode == AutoresetMode.SAME_STEP
-        endings = (
-            self._no_endings
-        )  # of few rows most steps have none, and to look for them takes longest
+        # Of few rows most steps have none, and to look for them takes longest.
+        endings = self._no_endings
         if len(ended):
-            endings = self._rows.measure(ended), observations[ended], masks[ended]
+            last = observations.take(ended, axis=0), masks.take(ended, axis=0)
+            endings = (self._rows.measure(ended), *last)
             if restarted:
                 self._draw(ended)
-                views[ended], masks[ended] = self._rows.observe(ended)
+                self._rows.observe_again(ended, views, masks)
         return Transition(
             observations,
             rewards,
