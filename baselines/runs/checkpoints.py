@@ -11,18 +11,20 @@ there is none, they were deleted.
 import hashlib
 import json
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import safetensors.numpy
+from safetensors import SafetensorError
 
-from baselines.runs.folder import CHECKPOINTS, METRICS_FILE, RunFolder, parse_json, read_metrics
-from mapp_env.files import make_folder, read_bytes, write_bytes
+from baselines.runs.folder import CHECKPOINTS, METRICS_FILE, RunFolder, read_metrics
+from mapp_env.files import make_folder, parse_json, read_bytes, write_bytes
 
 FORMAT = "mapp_env checkpoint"
-VERSION = 2
+VERSION = 3
 KEPT = 2
 MAX_ARRAYS_BYTES = 4 << 30
 MAX_STATE_BYTES = 64 << 20
@@ -41,32 +43,33 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be used; the message names the file and what is wrong."""
 
 
-class Resumable(Protocol):
+class Resumable(ABC):
     """A training that can be saved, and carried on."""
 
     @property
+    @abstractmethod
     def number(self) -> int:
         """How far it is: 0 at the start, and more at each checkpoint."""
-        ...
 
+    @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""
-        ...
 
+    @abstractmethod
     def state(self) -> dict[str, Any]:
         """Return all else that changes, ready for JSON."""
-        ...
 
+    @abstractmethod
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what the two above returned.
+        """Take over what :meth:`arrays` and :meth:`state` returned.
 
         Raises
         ------
         ValueError
             If something that must be there is not.
         """
-        ...
 
+    @abstractmethod
     def check_metrics(self, table: dict[str, list[float]]) -> None:
         """Compare where it stands with its metrics.csv.
 
@@ -75,7 +78,6 @@ class Resumable(Protocol):
         ValueError
             If they differ.
         """
-        ...
 
 
 class Checkpoints:
@@ -149,7 +151,7 @@ class Checkpoints:
         path = self._path(number, "json")
         try:
             text = read_bytes(path, MAX_STATE_BYTES, "a checkpoint", ValueError)
-            record = parse_json(text)
+            record = parse_json(text, "its state", ValueError)
             if not isinstance(record, dict) or record.get("format") != FORMAT:
                 raise ValueError("not a checkpoint")
             if record.get("version") != VERSION or record.get("number") != number:
@@ -161,15 +163,12 @@ class Checkpoints:
             if record["config_sha256"] != self.config:
                 raise ValueError("belongs to a run with another config")
             state, arrays_sha256 = record["state"], record["arrays_sha256"]
-        except (ValueError, KeyError, RecursionError) as error:
-            raise CheckpointError(f"{path}: {error}") from error
-        path = self._path(number, "safetensors")
-        try:
+            path = self._path(number, "safetensors")
             content = read_bytes(path, MAX_ARRAYS_BYTES, "a checkpoint", ValueError)
             if _digest(content) != arrays_sha256:
                 raise ValueError("changed since it was written: its digest differs")
             arrays = safetensors.numpy.load(content)
-        except Exception as error:  # safetensors raises its own error type, a plain Exception
+        except (ValueError, KeyError, SafetensorError) as error:
             raise CheckpointError(f"{path}: {error}") from error
         return Checkpoint(number, arrays, state)
 
@@ -206,8 +205,13 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def joined(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the arrays of all parts, each named after its part, a dot and its own name."""
+    return {f"{part}.{name}": array for part, own in parts.items() for name, array in own.items()}
+
+
 def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a name and a dot, without these."""
+    """Return one of the parts that :func:`joined` put together."""
     start = name + "."
     return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
 
