@@ -224,6 +224,20 @@ def test_a_resumed_run_takes_no_options(script, monkeypatch):
     assert parse_options(script.Args, "").resume == Path("run")
 
 
+@pytest.mark.parametrize(
+    ("script", "former", "name"),
+    [
+        (meta_dqn, "--huber", "huber_delta"),
+        (self_improve, "--sharpness", "inverse_temperature"),
+    ],
+)
+@pytest.mark.parametrize("words", ["{} 0.25", "{}=0.25"])
+def test_former_names_of_options_are_understood(script, former, name, words):
+    """Commands that were documented before an option was renamed still say the same."""
+    options = parse_options(script.Args, "", words.format(former).split())
+    assert getattr(options, name) == 0.25
+
+
 def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
     """With its weights, to the bit, even if it is gone later.
 
