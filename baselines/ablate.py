@@ -18,14 +18,12 @@ Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings, each with a checkpo
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import tyro
 
 from baselines import meta_dqn
-from baselines.learning.planned_run import Run, plan_run
-from baselines.learning.study import StudyArgs, check_distinct, run_study, train_all
+from baselines.learning.study import Groups, StudyArgs, check_distinct, run_study
 from mapp_env.validation import check_choice
 
 VARIANTS: dict[str, tuple[str, ...]] = {
@@ -60,20 +58,9 @@ class Args(StudyArgs):
         for variant in self.variants:
             check_choice("variants", variant, tuple(VARIANTS))
 
-
-def plan_runs(args: Args, words: Sequence[str]) -> list[Run]:
-    """Return all trainings, those of one seed together.
-
-    Raises
-    ------
-    ValueError
-        If an option is refused, or a folder holds a training with other options.
-    """
-    return [
-        plan_run((variant,), seed, args.out, meta_dqn, VARIANTS[variant], words)
-        for seed in range(args.seeds)
-        for variant in args.variants
-    ]
+    def groups(self) -> Groups:
+        """Return the variants."""
+        return {(variant,): (meta_dqn, VARIANTS[variant]) for variant in self.variants}
 
 
 def main(args: Args, words: Sequence[str] = ()) -> int:
@@ -84,8 +71,7 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
     ValueError
         If an option is refused, or a training has failed.
     """
-    runs, train = plan_runs(args, words), partial(train_all, jobs=args.jobs)
-    return run_study(runs, args.out / "ablation", ("variant",), train)[0]
+    return run_study(args, words, "ablation", ("variant",))[0]
 
 
 if __name__ == "__main__":

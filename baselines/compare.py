@@ -17,10 +17,10 @@ unsolved problem counted with the step limit) and of the return of the last trai
 Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings, each with a checkpoint.
 """
 
+import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Literal
@@ -28,8 +28,7 @@ from typing import Literal
 import tyro
 
 from baselines import independent_dqn, meta_dqn
-from baselines.learning.planned_run import Run, plan_run
-from baselines.learning.study import StudyArgs, Train, check_distinct, run_study, train_all
+from baselines.learning.study import Groups, StudyArgs, Train, check_distinct, run_study
 from baselines.learning.summary import Summary, interval
 from mapp_env.validation import check_count
 
@@ -70,38 +69,28 @@ class Args(StudyArgs):
                     f"default_updates has no effect with presets {self.presets!r}: leave it out"
                 )
 
-
-def plan_runs(args: Args, words: Sequence[str]) -> list[Run]:
-    """Return all trainings, those of one seed together.
-
-    Raises
-    ------
-    ValueError
-        If a learner does not take an option, or a folder holds a training with other options.
-    """
-    runs = []
-    for seed in range(args.seeds):
-        for preset in args.presets:
-            for learner in args.learners:
-                script, own = LEARNERS[learner]
-                own = ("--preset", preset, *own)
-                if preset == "default":
-                    own += ("--updates-per-episode", str(args.default_updates or 32))
-                runs.append(plan_run((preset, learner), seed, args.out, script, own, words))
-    return runs
+    def groups(self) -> Groups:
+        """Return each learner under each preset."""
+        found: Groups = {}
+        for preset, learner in itertools.product(self.presets, self.learners):
+            script, own = LEARNERS[learner]
+            updates = ("--updates-per-episode", str(self.default_updates or 32))
+            own = ("--preset", preset, *own, *(updates if preset == "default" else ()))
+            found[preset, learner] = script, own
+        return found
 
 
-def compare(out: Path, runs: Sequence[Run], train: Train) -> int:
+def main(args: Args, words: Sequence[str] = (), train: Train | None = None) -> int:
     """Train, compare, draw; return the exit code.
 
     Raises
     ------
     ValueError
-        If a training has failed.
+        If an option is refused, or a training has failed.
     """
-    code, summaries = run_study(runs, out / "comparison", COLUMNS, train)
+    code, summaries = run_study(args, words, "comparison", COLUMNS, train)
     if code == 0:
-        draw(out, summaries)
+        draw(args.out, summaries)
     return code
 
 
@@ -111,17 +100,6 @@ def draw(out: Path, summaries: Sequence[Summary]) -> None:
     from baselines.policies.figures import draw_comparison
 
     print(draw_comparison(out, summaries, interval))
-
-
-def main(args: Args, words: Sequence[str] = ()) -> int:
-    """Train, compare, draw; return the exit code.
-
-    Raises
-    ------
-    ValueError
-        If an option is refused, or a training has failed.
-    """
-    return compare(args.out, plan_runs(args, words), partial(train_all, jobs=args.jobs))
 
 
 if __name__ == "__main__":

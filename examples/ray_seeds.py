@@ -37,7 +37,7 @@ from filelock import FileLock, Timeout
 
 from baselines import compare
 from baselines.learning.config import parse_options
-from baselines.learning.planned_run import Run
+from baselines.learning.study import Run
 from baselines.runs.folder import LOCK_FILE
 from baselines.runs.stop import StopSignals
 from mapp_env.validation import check_count
@@ -163,10 +163,10 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
         If an option is refused, or a training has failed.
     """
     args.out = args.out.resolve()
-    runs = compare.plan_runs(args, words)
+    args.plan(words)  # what is refused is refused before Ray is started
     start_ray(args.address, args.jobs, args.max_retries)
     try:
-        return compare.compare(args.out, runs, partial(train_all, max_retries=args.max_retries))
+        return compare.main(args, words, partial(train_all, max_retries=args.max_retries))
     finally:
         ray.shutdown()
 

@@ -203,6 +203,7 @@ class Options(RunOptions):
 def without_effect(options: Options) -> dict[str, str]:
     """Return the options that the choice of another leaves without effect, and that choice."""
     o = options
+    replay: str = o.replay  # that of independent learners has one more
     final = ("final_reward", "final_discount", "final_reward_scale")
     relabels = "relabelled" in allowed_values(type(options), "replay")
     choices = (
@@ -214,7 +215,7 @@ def without_effect(options: Options) -> dict[str, str]:
             o.replay != "imagined",
             ("tried_actions", "temperature", *(n for n in vars(o) if n.startswith("imagined_"))),
         ),
-        ("replay", o.replay != "relabelled", ("fresh_as_far",)),
+        ("replay", replay != "relabelled", ("fresh_as_far",)),
         ("replay", o.replay == "stored", ("fresh_landmarks",)),
         # Independent learners keep what they have seen of the others.
         ("replay", o.replay == "imagined" and not relabels, ("memory_size",)),

@@ -20,6 +20,7 @@ from baselines.learning.optimiser import optimiser_arrays, restore_optimiser
 from baselines.learning.ranges import Share, Within
 from baselines.learning.train import Trainable
 from baselines.networks import Network
+from baselines.policies.evaluation import Evaluation
 from baselines.runs.checkpoints import joined, part
 from baselines.runs.folder import WEIGHTS_FILE
 
@@ -86,11 +87,6 @@ class Imitation(Trainable):
         """What is trained."""
         return self._network
 
-    @property
-    def done(self) -> int:
-        """Updates so far."""
-        return self.updates
-
     def counts(self) -> dict[str, int]:
         """Return what was done so far."""
         return {"updates": self.updates}
@@ -113,12 +109,10 @@ class Imitation(Trainable):
         self.losses.clear()
         return row
 
-    # -- checkpoints
+    def draw(self, folder: Path, evaluations: dict[str, Evaluation]) -> None:
+        """Draw nothing: the paper's figures are of episodes."""
 
-    @property
-    def number(self) -> int:
-        """Updates so far."""
-        return self.updates
+    # -- checkpoints
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""

@@ -26,16 +26,17 @@ def check_options(options: Any) -> None:
     ValueError
         If a number is out of its range, or a flag or choice is none.
     """
-    for name, (kind, *metadata) in _annotations(type(options)).items():
+    for name, (kind, *metadata) in _annotations(options.__class__).items():
         value = getattr(options, name)
         if kind is bool:
             check_flag(name, value)
         elif get_origin(kind) is Literal:
             check_choice(name, value, get_args(kind))
         for bounds in metadata:
-            if isinstance(bounds, Within):
-                check = check_count if kind is int else check_number
-                check(name, value, *bounds)
+            if isinstance(bounds, Within) and kind is int:
+                check_count(name, value, int(bounds.least), int(bounds.most))
+            elif isinstance(bounds, Within):
+                check_number(name, value, *bounds)
 
 
 @functools.cache

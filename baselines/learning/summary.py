@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from baselines.learning.planned_run import Run
 from baselines.runs.folder import EVALUATION_FILE, TIMING_FILE, read_metrics
 from mapp_env.files import read_bytes, read_json, write_text
 
@@ -28,7 +27,7 @@ CUT = 0.25  # from each side: the interquartile mean
 class Outcome(NamedTuple):
     """What came out of one run."""
 
-    run: Run
+    group: tuple[str, ...]
     measures: dict[str, float]  # a key of MEASURES each; NaN where there is none
     returns: np.ndarray  # (episodes,), while training
     solved: np.ndarray  # (episodes,) 0 or 1
@@ -44,19 +43,19 @@ MEASURES = {
 }
 
 
-def read_outcome(run: Run) -> Outcome:
-    """Read what came out of a run.
+def read_outcome(group: tuple[str, ...], folder: Path, max_cycles: int) -> Outcome:
+    """Read what came out of a run of a group, with a step limit.
 
     Raises
     ------
     ValueError
         If a file of it cannot be read.
     """
-    path = run.folder / EVALUATION_FILE
+    path = folder / EVALUATION_FILE
     text = read_bytes(path, MAX_TABLE_BYTES, "a table", ValueError).decode(errors="replace")
     rows = {row.get("policy"): row for row in csv.DictReader(io.StringIO(text))}
-    metrics = read_metrics(run.folder)
-    timing = read_json(run.folder / TIMING_FILE, MAX_TABLE_BYTES, "a timing file", ValueError)
+    metrics = read_metrics(folder)
+    timing = read_json(folder / TIMING_FILE, MAX_TABLE_BYTES, "a timing file", ValueError)
     try:
         row = rows[ROW]
         returns, solved = np.array(metrics["reward"]), np.array(metrics["solved"])
@@ -64,13 +63,13 @@ def read_outcome(run: Run) -> Outcome:
             "solved %": float(row["solved %"]),
             "gap %": float(row["gap %"]),
             "optimal %": float(row["optimal %"]),
-            "cover time": float(row[f"unsolved = {run.options.max_cycles}"]),
+            "cover time": float(row[f"unsolved = {max_cycles}"]),
             "return": float(returns[-RETURN_EPISODES:].mean()),
             "minutes": float(timing["seconds_total"]) / 60.0,
         }
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not the evaluation of a training: {error!r}") from error
-    return Outcome(run, measures, returns, solved)
+    return Outcome(group, measures, returns, solved)
 
 
 # -- statistics --------------------------------------------------------------------------------
@@ -125,7 +124,7 @@ def summarise(outcomes: Iterable[Outcome]) -> list[Summary]:
     """Put the outcomes of all seeds of a group together, in their order."""
     groups: dict[tuple[str, ...], list[Outcome]] = {}
     for outcome in outcomes:
-        groups.setdefault(outcome.run.group, []).append(outcome)
+        groups.setdefault(outcome.group, []).append(outcome)
     summaries = []
     for group, members in groups.items():
         measures = {}

@@ -7,7 +7,7 @@ policies at the end.
 
 import signal
 import time
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -46,7 +46,7 @@ from baselines.runs.stop import StopSignals
 from baselines.runs.stopwatch import Stopwatch
 
 
-class Trainable(Resumable):
+class Trainable(Resumable, ABC):
     """A training that can be stopped between any two steps or updates, and carried on.
 
     Parameters
@@ -72,30 +72,37 @@ class Trainable(Resumable):
     def network(self) -> Network:
         """What is trained, and kept as the policy."""
 
-    @property
     @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """Return what was done so far: episodes, steps, updates."""
+
+    @property
     def done(self) -> int:
         """Episodes or updates so far."""
+        return self.counts()[self.UNIT]
 
     @property
     def finished(self) -> bool:
         """Whether that is all of them."""
         return self.done >= self.total
 
+    @property
+    def number(self) -> int:
+        """Steps and updates so far."""
+        counts = self.counts()
+        return counts.get("steps", 0) + counts["updates"]
+
     @abstractmethod
     def advance(self) -> dict[str, object] | None:
         """Carry out one step or update; return a row of metrics.csv if one is complete."""
-
-    @abstractmethod
-    def counts(self) -> dict[str, int]:
-        """Return what was done so far: episodes, steps, updates."""
 
     def rivals(self, policy: NetworkPolicy) -> dict[str, Acting]:
         """Return what the table at the end shows beside the policy and the rules of thumb."""
         return {}
 
+    @abstractmethod
     def draw(self, folder: Path, evaluations: dict[str, Evaluation]) -> None:
-        """Draw the figures of a run, into its folder."""
+        """Draw the figures of a run, if it has some, into its folder."""
 
 
 def run_training(

@@ -15,6 +15,7 @@ from baselines.policies.evaluation import EVALUATION_SEED, Evaluation
 from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
 from baselines.policies.policy import NetworkPolicy, RandomPolicy
 from baselines.policies.settings import N_ACTIONS, Setting, read_setting
+from baselines.runs.checkpoints import Saved
 from mapp_env import Grid, mapp_v0, sample_problems
 from mapp_env.grids import find_grid
 
@@ -25,7 +26,7 @@ METRICS = (
 DRAWN = ("network alone", "network, guidance 1")  # whose routes are
 
 
-class Learner(Protocol):
+class Learner(Saved, Protocol):
     """What is trained."""
 
     updates: int
@@ -52,15 +53,6 @@ class Learner(Protocol):
 
     def policy(self) -> NetworkPolicy:
         """Return what was learned."""
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays that change, by name."""
-
-    def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
-
-    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what the two above returned."""
 
 
 class Streams(NamedTuple):
@@ -135,11 +127,6 @@ class Training(Trainable):
     def network(self) -> Network:
         """What was learned."""
         return self.learner.policy().network
-
-    @property
-    def done(self) -> int:
-        """Episodes that are over."""
-        return self.now.episodes
 
     @property
     def problem(self) -> int:
@@ -231,11 +218,6 @@ class Training(Trainable):
         return row
 
     # -- checkpoints
-
-    @property
-    def number(self) -> int:
-        """Steps and updates so far."""
-        return self.now.steps + self.learner.updates
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""

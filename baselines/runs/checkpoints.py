@@ -11,10 +11,9 @@ there is none, they were deleted.
 import hashlib
 import json
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import safetensors.numpy
@@ -43,41 +42,28 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be used; the message names the file and what is wrong."""
 
 
-class Resumable(ABC):
-    """A training that can be saved, and carried on."""
+class Saved(Protocol):
+    """What a checkpoint holds."""
 
-    @property
-    @abstractmethod
-    def number(self) -> int:
-        """How far it is: 0 at the start, and more at each checkpoint."""
-
-    @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""
 
-    @abstractmethod
     def state(self) -> dict[str, Any]:
         """Return all else that changes, ready for JSON."""
 
-    @abstractmethod
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what :meth:`arrays` and :meth:`state` returned.
+        """Take over what the two above returned; a ValueError if something is not there."""
 
-        Raises
-        ------
-        ValueError
-            If something that must be there is not.
-        """
 
-    @abstractmethod
+class Resumable(Saved, Protocol):
+    """A training that can be saved, and carried on."""
+
+    @property
+    def number(self) -> int:
+        """How far it is: 0 at the start, and more at each checkpoint."""
+
     def check_metrics(self, table: dict[str, list[float]]) -> None:
-        """Compare where it stands with its metrics.csv.
-
-        Raises
-        ------
-        ValueError
-            If they differ.
-        """
+        """Raise a ValueError if metrics.csv tells of another point."""
 
 
 class Checkpoints:
@@ -244,19 +230,7 @@ def save(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> None:
 
 
 def go_on(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> bool:
-    """Bring a training to its newest whole checkpoint; leave it at its start if there was none.
-
-    Parameters
-    ----------
-    run, checkpoints
-        The run's folder and its checkpoints.
-    training
-        What is carried on, at its start.
-
-    Returns
-    -------
-    bool
-        Whether there was a checkpoint.
+    """Bring a training, at its start, to its newest whole checkpoint; return whether there is one.
 
     Raises
     ------
@@ -299,25 +273,16 @@ def check_restored(checkpoint: Checkpoint, training: Resumable) -> None:
         If the next checkpoint would not hold the same.
     """
     state = {**training.state(), "metrics": checkpoint.state["metrics"]}
-    arrays = training.arrays()
-    differing = [
-        name
-        for name in sorted(state.keys() | checkpoint.state.keys())
-        if _canonical({name: state.get(name)}) != _canonical({name: checkpoint.state.get(name)})
-    ]
-    differing += [
-        name
-        for name in sorted(arrays.keys() | checkpoint.arrays.keys())
-        if not _equal(arrays.get(name), checkpoint.arrays.get(name))
-    ]
-    if checkpoint.number != training.number:
-        differing.append("number")
+    saved = _entries(checkpoint)
+    found = _entries(Checkpoint(training.number, training.arrays(), state))
+    differing = sorted(k for k in saved.keys() | found.keys() if saved.get(k) != found.get(k))
     if differing:
         raise ValueError(f"it has not all of {', '.join(differing)}, or something else there")
 
 
-def _equal(one: np.ndarray | None, other: np.ndarray | None) -> bool:
-    if one is None or other is None:
-        return False
-    same = (one.dtype, one.shape) == (other.dtype, other.shape)
-    return same and one.tobytes() == other.tobytes()
+def _entries(checkpoint: Checkpoint) -> dict[str, object]:
+    """Return everything in a checkpoint by name, in a form that is equal only if all bits are."""
+    number, arrays, state = checkpoint
+    texts = {f"state {name}": _canonical({name: value}) for name, value in state.items()}
+    parts = {name: (a.dtype, a.shape, a.tobytes()) for name, a in arrays.items()}
+    return {"number": number, **texts, **parts}

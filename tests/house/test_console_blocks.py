@@ -189,8 +189,8 @@ def read_by_script(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
             start(command, patch)
     taken = stopped.value.args[0]
     if isinstance(taken, tuple):  # a study, which hands what is not its own to every training
-        script = importlib.import_module(command.split()[1].removesuffix(".py").replace("/", "."))
-        getattr(script, "compare", script).plan_runs(*taken)
+        args, words = taken
+        args.plan(words)
 
 
 def read_installation(words: list[str]) -> None:

@@ -14,7 +14,7 @@ from scipy import stats
 
 from baselines import compare, independent_dqn, meta_dqn
 from baselines.compare import Args
-from baselines.learning import planned_run, summary
+from baselines.learning import study, summary
 from baselines.learning.config import parse_options
 from baselines.learning.summary import MEASURES, Interval, format_interval, interval
 from baselines.learning.training import Training
@@ -76,7 +76,7 @@ def test_finished_runs_are_not_repeated(compared, monkeypatch, capsys):
     def refuse(*arguments, **options):
         raise AssertionError("a process was started")
 
-    monkeypatch.setattr(planned_run.subprocess, "Popen", refuse)
+    monkeypatch.setattr(study.subprocess, "Popen", refuse)
     assert compare.main(tiny(compared), WORDS) == 0
     assert "4 of 4 trainings were finished already" in capsys.readouterr().out
     assert [(compared / name).read_bytes() for name in names] == before
@@ -165,7 +165,7 @@ def test_what_another_is_about_to_train_is_left_alone(tmp_path):
 def test_updates_of_the_default_preset_can_be_fewer(tmp_path):
     """They are set for that preset alone."""
     args = tiny(tmp_path, presets=("default", "paper"), default_updates=7)
-    runs = compare.plan_runs(args, [])
+    runs = args.plan([])
     updates = {run.group[0]: run.options.updates_per_episode for run in runs}
     assert updates == {"default": 7, "paper": 0}
     with pytest.raises(ValueError, match=r"default_updates has no effect with presets .*paper"):
@@ -195,7 +195,7 @@ def test_failed_training_is_reported(tmp_path, monkeypatch):
 
 def test_a_signal_stops_all_trainings(tmp_path, monkeypatch, capsys):
     """Exit code 143, no process left behind, and the comparison can go on."""
-    started, start = [], planned_run.Run.start
+    started, start = [], study.Run.start
 
     def starting(run):
         process = start(run)
@@ -203,13 +203,13 @@ def test_a_signal_stops_all_trainings(tmp_path, monkeypatch, capsys):
         os.kill(os.getpid(), signal.SIGTERM)
         return process
 
-    monkeypatch.setattr(planned_run.Run, "start", starting)
+    monkeypatch.setattr(study.Run, "start", starting)
     assert compare.main(tiny(tmp_path, learners=("meta",)), WORDS) == 128 + signal.SIGTERM
     assert len(started) == 1
     assert started[0].returncode is not None
     assert "the same command goes on" in capsys.readouterr().out
     # Whatever state it was stopped in is one that a later call takes up.
-    compare.plan_runs(tiny(tmp_path, learners=("meta",)), WORDS)
+    tiny(tmp_path, learners=("meta",)).plan(WORDS)
     shutil.rmtree(tmp_path)
 
 
@@ -276,7 +276,7 @@ def test_every_learner_takes_the_presets():
 def finished_run(out, seed, solved, learner="meta"):
     """Return a run with files as if it had been trained for 150 episodes and evaluated."""
     args = tiny(out / f"{learner}{seed}", learners=(learner,), seeds=seed + 1)
-    run = next(run for run in compare.plan_runs(args, WORDS) if run.seed == seed)
+    run = next(run for run in args.plan(WORDS) if run.seed == seed)
     run.folder.mkdir(parents=True)
     header = "policy,problems,solved %,gap %,optimal %,unsolved = 15\n"
     gap = "nan" if solved == 0 else "8.0"
@@ -292,7 +292,7 @@ def finished_run(out, seed, solved, learner="meta"):
 
 def test_an_outcome_is_what_the_files_say(tmp_path):
     """Figures are those of the network alone, the return that of the last hundred episodes."""
-    outcome = summary.read_outcome(finished_run(tmp_path, 0, 50.0))
+    outcome = finished_run(tmp_path, 0, 50.0).outcome()
     assert outcome.measures == {
         "solved %": 50.0,
         "gap %": 8.0,
@@ -307,7 +307,7 @@ def test_an_outcome_is_what_the_files_say(tmp_path):
 def test_who_solves_nothing_has_no_gap(tmp_path):
     """The gap is summed up over those that have one, and it is said of how many."""
     outcomes = [
-        summary.read_outcome(finished_run(tmp_path, seed, solved))
+        finished_run(tmp_path, seed, solved).outcome()
         for seed, solved in enumerate((0.0, 50.0, 70.0))
     ]
     (group,) = summary.summarise(outcomes)
@@ -329,7 +329,7 @@ def test_all_learners_have_the_updates_asked_for(tmp_path):
     """The budget of the default preset is the same for every learner."""
     args = tiny(tmp_path, presets=("default",), learners=tuple(compare.LEARNERS), seeds=1)
     for default_updates in (7, 32):
-        runs = compare.plan_runs(replace(args, default_updates=default_updates), [])
+        runs = replace(args, default_updates=default_updates).plan([])
         assert [run.group[1] for run in runs] == list(compare.LEARNERS)
         assert {r.options.updates_per_episode for r in runs} == {default_updates}
 
@@ -337,7 +337,7 @@ def test_all_learners_have_the_updates_asked_for(tmp_path):
 def test_curves_are_those_of_the_episodes(tmp_path, monkeypatch):
     """Drawn are running means over the seeds, at the episodes that they end with, in per cent."""
     outcomes = [
-        summary.read_outcome(finished_run(tmp_path, seed, 50.0, learner))
+        finished_run(tmp_path, seed, 50.0, learner).outcome()
         for learner in ("meta", "shared")
         for seed in (0, 1)
     ]
