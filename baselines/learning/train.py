@@ -165,6 +165,9 @@ def run_training(
             # Without a terminal there is no bar: say where to look.
             where = run.path(METRICS_FILE)
             print(f"training, {training.total:,} {training.UNIT}: {where}", flush=True)
+            if not checkpoints.numbers():
+                # What it starts from, to the bit: it may have to start again.
+                save_policy(run.path(WEIGHTS_FILE), training.network)
             train(training, run, checkpoints, signals)
         counts = ", ".join(f"{count:,} {name}" for name, count in training.counts().items())
         print(f"{counts} in {training.watch}")
@@ -188,8 +191,6 @@ def train(
     """Train until all is done, or a signal comes; then leave a checkpoint."""
     weights, half = run.path(WEIGHTS_FILE), training.args.half_precision
     if not checkpoints.numbers():
-        # What it starts from, to the bit: it may have to start again.
-        save_policy(weights, training.network)
         save(run, checkpoints, training)
     bar = tqdm(
         total=training.total,
