@@ -1,10 +1,10 @@
-"""Teach a network the exact solver's answers: learning combined with mathematical optimisation.
+"""Train a network on the exact solver's answers: learning combined with mathematical optimisation.
 
 Method: imitation of all optimal joint actions at once. In each state of episodes that the network
 itself plays (as in DAgger, Ross et al. 2011) the exact solver says which joint actions are optimal,
 and the loss is minus the logarithm of the probability that the network gives to them together.
-States that it answers wrongly are asked again until it answers them rightly. This is not
-reinforcement learning, and policies made by it are called distilled.
+States in which its greedy action is not optimal come again until it is. This is not reinforcement
+learning, and policies made by it are called distilled.
 
 Paper: section 6, last paragraph (arXiv 2110.01460): learning combined with optimisation.
 
@@ -40,7 +40,7 @@ from mapp_env.grids import find_grid
 from mapp_env.validation import check_count
 
 ALGORITHM = "distill"
-MAX_MISTAKES = 4096  # states that are waiting to be asked again; the oldest is forgotten
+MAX_MISTAKES = 4096  # states that wait to come again; the oldest is forgotten
 MAX_CELLS = 4096  # of whose distances there is a table
 
 
@@ -74,7 +74,7 @@ class Args(ImitationOptions):
     batch_size: Annotated[int, Within(1, 65_536)] = 512
     """states in an update"""
     asked_again: Annotated[int, Within(0, 65_536)] = 128
-    """at most so many states in an update besides, those that were answered wrongly before"""
+    """at most so many states in an update besides, those with a wrong answer before"""
     exploration: Share = 0.1
     """probability that an episode goes on with a random joint action"""
     from_depot: Share = 0.95
@@ -116,7 +116,7 @@ class Distilled(Imitation):
             *(spec, grid.depot, args.batch_size, 1, 1.0, 0.0),
             *(args.from_depot, args.max_length),
         )
-        # Here the grid may be read: the solver knows it as well.
+        # Here the grid may be read, as the solver reads it, too.
         reached = np.append(grid.reachable, grid.depot)
         self.states.moves[reached] = np.asarray(grid.moves)[reached, :N_ACTIONS]
         self.distances = np.asarray(grid.distances, np.int64)
@@ -144,7 +144,7 @@ class Distilled(Imitation):
         return good_actions_loss(scores, optimal)
 
     def own_arrays(self) -> dict[str, dict[str, np.ndarray]]:
-        """Return the states, and those that are asked again."""
+        """Return the states, and those that come again."""
         return {"states": self.states.arrays_by_name(), "mistakes": {"obs": self.mistakes}}
 
     def restore_own(self, arrays: dict[str, np.ndarray]) -> None:
@@ -154,7 +154,13 @@ class Distilled(Imitation):
 
 
 def main(args: Args) -> int:
-    """Teach and evaluate; return the exit code."""
+    """Train and evaluate; return the exit code.
+
+    Raises
+    ------
+    ValueError
+        If an option, the policy or the folder cannot be used.
+    """
     args = own_options(args, ALGORITHM)
     if args.resume is None:
         setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)

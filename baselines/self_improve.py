@@ -1,16 +1,15 @@
 """Improve a trained policy by imitating the best of several of its own episodes.
 
-Method: self-imitation. Of each random problem several episodes are played at once in the batched
-environment: one greedily, the others with actions drawn from the policy, just so boldly that they
-become a few per cent longer. Where one is shorter than the greedy one, it is played again from each
-of its states with other likely actions, to see which of them are as good; those states, with all
-good actions, are kept and taught for a while, and the problem comes again until the greedy episode
-is as short. Besides, the network is taught to go on as it does where nothing shorter was found.
-This is reinforcement learning by trial alone: all that is known of a problem is how long one's own
-episodes on it took, never the optimum, and walls are met by bumping into them. In the spirit of
-self-imitation learning (Oh et al. 2018) and of rollout-based policy iteration by classification
-(Lagoudakis and Parr 2003). As many problems are played as updates allow: on a small grid, in the
-end, nearly all there are.
+Method: self-imitation. Several episodes are played at once of each random problem: one greedily,
+the others with actions drawn from the policy, just so boldly that they become a few per cent
+longer. Where one is shorter than the greedy one, it is played again from each of its states with
+other likely actions, to find those that are as good; these states, with all good actions, are kept
+as training data, and the problem comes again until the greedy episode is as short. Where nothing
+shorter was found, the network imitates the greedy episode. This is reinforcement learning by trial
+alone: all that is known of a problem is how long the policy's own episodes on it took, never the
+optimum, and walls are met by bumping into them. In the spirit of self-imitation learning (Oh et al.
+2018) and of rollout-based policy iteration by classification (Lagoudakis and Parr 2003). As many
+problems are played as updates allow: on a small grid, in the end, nearly all there are.
 
 It starts from a policy of ``meta_dqn.py``: the larger its values, the likelier its actions.
 
@@ -160,7 +159,9 @@ class SelfImproved(Imitation):
         self.again = left[-MAX_AGAIN:] if args.played_again else left[:0]
         taken = (steps < shortest) & (shortest <= args.max_length)  # (T, problems)
         if not taken.any():
-            raise ValueError("policy: it solves no problem within max_length, so nothing is taught")
+            raise ValueError(
+                "policy: it solves no problem within max_length, so there is nothing to imitate"
+            )
         self.fresh = Labelled(
             obs[taken], np.eye(self.spec.n_joint_actions, dtype=np.bool_)[joint[taken]]
         )
@@ -210,7 +211,7 @@ class SelfImproved(Imitation):
             return Labelled(states, good)
         with torch.inference_mode():
             tried = self.network(torch.from_numpy(states)).topk(n_tried).indices.numpy()
-        # A row for each state and action; those left over play something, and nobody looks.
+        # A row for each state and action; those left over are not looked at.
         running = np.arange(n_envs) < len(states) * n_tried
         index = np.resize(np.repeat(np.arange(len(states)), n_tried), n_envs)
         action = np.resize(tried.ravel(), n_envs)

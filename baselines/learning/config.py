@@ -217,7 +217,7 @@ def without_effect(options: Options) -> dict[str, str]:
         ),
         ("replay", replay != "relabelled", ("fresh_as_far",)),
         ("replay", o.replay == "stored", ("fresh_landmarks",)),
-        # Independent learners keep what they have seen of the others.
+        # Independent learners keep what the others did.
         ("replay", o.replay == "imagined" and not relabels, ("memory_size",)),
         ("tried_actions", o.tried_actions == 1, ("temperature", "imagined_exploration")),
         ("final_reward", o.final_reward == "same", ("final_from", *final[1:])),

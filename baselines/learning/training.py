@@ -1,4 +1,4 @@
-"""Learning by trial: problems one after the other, episode by episode, whoever learns."""
+"""Reinforcement learning: problems one after the other, episode by episode, for any learner."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
