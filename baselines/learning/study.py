@@ -157,18 +157,7 @@ def plan_run(
     own: Sequence[str],
     words: Sequence[str],
 ) -> Run:
-    """Return a run of a study.
-
-    Parameters
-    ----------
-    group, seed, out
-        What it is one of; its folder in `out` is named after them.
-    script
-        The learner's: ``baselines.meta_dqn``, say.
-    own
-        Words of the command line that make it what it is.
-    words
-        Further words, the same for all.
+    """Return a run: a learner's script, its `own` words of a command line, those for all runs.
 
     Raises
     ------

@@ -91,13 +91,10 @@ def interval(values: np.ndarray) -> Interval:
     generator of its own, so that the same runs give the same table.
     """
     n = len(values)
-    if n == 0:
-        nothing = np.full(values.shape[1:], np.nan)
-        return Interval(nothing, nothing, nothing, 0)
-    mean = np.asarray(stats.trim_mean(values, CUT, axis=0))
-    if n == 1:
-        nothing = np.full(mean.shape, np.nan)
-        return Interval(mean, nothing, nothing, 1)
+    nothing = np.full(values.shape[1:], np.nan)
+    mean = np.asarray(stats.trim_mean(values, CUT, axis=0)) if n else nothing
+    if n < 2:
+        return Interval(mean, nothing, nothing, n)
     curve = values.ndim > 1
     found = stats.bootstrap(
         (values,),
