@@ -40,16 +40,15 @@ Output: a run folder as of meta_dqn.py; policy.safetensors holds the networks of
 
 import sys
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from baselines.learning.config import Options, parse_options
-from baselines.learning.experiment import run_experiment
 from baselines.learning.q_learning import Goal, QLearner, next_values, td_targets
-from baselines.learning.training import Streams
+from baselines.learning.training import Streams, train_learner
 from baselines.networks import (
     Network,
     NetworkSpec,
@@ -77,10 +76,6 @@ ALGORITHM = "independent_dqn"
 @dataclass(frozen=True)
 class Args(Options):
     """Options of independent learners; those of joint values have no effect."""
-
-    OUTPUTS: ClassVar[tuple[str, ...]] = ("agents",)
-    REPLAYS: ClassVar[tuple[str, ...]] = ("relabelled", "imagined", "stored")
-    NETWORKS: ClassVar[tuple[str, ...]] = ("pairs", "paper", "geodesic")
 
     network: Literal["pairs", "paper", "geodesic"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
@@ -390,7 +385,7 @@ class IndependentLearners:
 
 def main(args: Args) -> int:
     """Train, evaluate, draw; return the exit code."""
-    return run_experiment(args, ALGORITHM, IndependentLearners)
+    return train_learner(args, ALGORITHM, IndependentLearners)
 
 
 if __name__ == "__main__":

@@ -31,9 +31,8 @@ import torch
 from torch import Tensor
 
 from baselines.learning.config import Options, parse_options
-from baselines.learning.experiment import run_experiment
 from baselines.learning.q_learning import QLearner, next_values, td_targets
-from baselines.learning.training import Streams
+from baselines.learning.training import Streams, train_learner
 from baselines.networks import (
     Network,
     NetworkSpec,
@@ -248,7 +247,7 @@ def joint_values(values: Tensor, spec: NetworkSpec) -> Tensor:
 
 def main(args: Args) -> int:
     """Train, evaluate, draw; return the exit code."""
-    return run_experiment(args, ALGORITHM, MetaLearner)
+    return train_learner(args, ALGORITHM, MetaLearner)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ import socket
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -36,9 +37,9 @@ from filelock import FileLock, Timeout
 
 from baselines import compare
 from baselines.learning.config import parse_options
-from baselines.learning.study import gather, last_line, make_folder
-from baselines.learning.trials import Trial, check_folder
-from baselines.runs.folder import LOCK_FILE, StopSignals
+from baselines.learning.study import Run
+from baselines.runs.folder import LOCK_FILE
+from baselines.runs.stop import StopSignals
 from mapp_env.validation import check_count
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,7 +64,7 @@ class Args(compare.Args):
         check_count("max_retries", self.max_retries, 0, 1000)
 
 
-def train(trial: Trial, directory: Path) -> int:
+def train(run: Run, directory: Path) -> int:
     """Train in this process, or resume the run of a lost one; return the exit code.
 
     Paths in options are relative to `directory`.
@@ -75,19 +76,19 @@ def train(trial: Trial, directory: Path) -> int:
     """
     # Line buffered: all that remains of a killed process.
     with (
-        trial.log.open("a", buffering=1, encoding="utf-8") as log,
+        run.log.open("a", buffering=1, encoding="utf-8") as log,
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),
     ):
         print(f"process {os.getpid()} on {socket.gethostname()}")
         with contextlib.suppress(FileNotFoundError):  # not needed where no option names a file
             os.chdir(directory)
-        wait_until_left(trial.folder)
-        check_folder(trial)
-        if trial.finished:
+        wait_until_left(run.folder)
+        run.check_folder()
+        if run.finished:
             return 0
-        learner = importlib.import_module(f"baselines.{trial.algorithm}")
-        code: int = learner.main(parse_options(type(trial.options), "", trial.arguments))
+        learner = importlib.import_module(f"baselines.{run.algorithm}")
+        code: int = learner.main(parse_options(type(run.options), "", run.arguments))
     return code
 
 
@@ -118,35 +119,31 @@ def start_ray(address: str | None, jobs: int, max_retries: int) -> None:
         )
 
 
-def train_all(trials: Sequence[Trial], max_retries: int, signals: StopSignals) -> list[str]:
+def train_all(runs: Sequence[Run], signals: StopSignals, max_retries: int) -> list[str]:
     """Train unfinished runs as Ray tasks; return one line for each failure."""
-    waiting = [trial for trial in trials if not trial.finished]
-    done = len(trials) - len(waiting)
-    if done:
-        print(f"{done} of {len(trials)} trainings were finished already")
     # One call per process: nothing is left over from the previous run.
     task = ray.remote(num_cpus=1, max_calls=1, max_retries=max_retries)(train)
-    running = {task.remote(trial, Path.cwd()): trial for trial in waiting}
+    running = {task.remote(run, Path.cwd()): run for run in runs}
     failures: list[str] = []
-    told = False
+    told, done = False, 0
     while running:
         if signals.received is not None and not told:
             told = True
             for reference in running:
                 ray.cancel(reference)  # like Ctrl-C: the run saves a checkpoint and returns
         for reference in ray.wait(list(running), timeout=0.5)[0]:
-            trial = running.pop(reference)
-            problem = describe_failure(reference, trial)
+            run = running.pop(reference)
+            problem = describe_failure(reference, run)
             if problem is None:
                 done += 1
-                print(f"{done}/{len(trials)} {trial.name}", flush=True)
+                print(f"{done}/{len(runs)} {run.name}", flush=True)
             elif not told:
-                failures.append(f"{trial.name}: {problem}")
+                failures.append(f"{run.name}: {problem}")
                 print(f"failed: {failures[-1]}", flush=True)
     return failures
 
 
-def describe_failure(reference: "ray.ObjectRef[int]", trial: Trial) -> str | None:
+def describe_failure(reference: "ray.ObjectRef[int]", run: Run) -> str | None:
     """Return why a finished task failed, or None if it succeeded."""
     try:
         code = ray.get(reference)
@@ -154,7 +151,7 @@ def describe_failure(reference: "ray.ObjectRef[int]", trial: Trial) -> str | Non
         return str(error.cause)
     except ray.exceptions.RayError as error:  # lost once too often, or cancelled
         return str(error).strip().splitlines()[0]
-    return None if code == 0 and trial.finished else last_line(trial.log)
+    return None if code == 0 and run.finished else run.last_words()
 
 
 def main(args: Args, words: Sequence[str] = ()) -> int:
@@ -166,22 +163,12 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
         If an option is refused, or a run has failed.
     """
     args.out = args.out.resolve()
-    trials = compare.plan_trials(args, words)
-    make_folder(args.out)
-    signals = StopSignals()
+    args.plan(words)  # what is refused is refused before Ray is started
     start_ray(args.address, args.jobs, args.max_retries)
     try:
-        with signals:
-            failures = train_all(trials, args.max_retries, signals)
+        return compare.main(args, words, partial(train_all, max_retries=args.max_retries))
     finally:
         ray.shutdown()
-    if signals.received is not None:
-        print("stopped early; the same command goes on", flush=True)
-        return 128 + signals.received
-    if failures:
-        raise ValueError("these trainings failed: " + "; ".join(failures))
-    compare.draw(args.out, gather(trials, args.out / compare.TABLE, compare.COLUMNS))
-    return 0
 
 
 if __name__ == "__main__":

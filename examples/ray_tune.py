@@ -39,8 +39,7 @@ from ray.tune.search.basic_variant import BasicVariantGenerator
 from ray_seeds import start_ray
 
 from baselines.learning.config import preset_options
-from baselines.learning.experiment import training_problems
-from baselines.learning.training import Streams, Training
+from baselines.learning.training import Streams, Training, training_problems
 from baselines.meta_dqn import Args as Options
 from baselines.meta_dqn import MetaLearner
 from baselines.policies.evaluation import Evaluation, evaluate, find_optima, unseen_problems

@@ -160,7 +160,7 @@ class QLearner(ABC):
             group["lr"] = rate
         values = self.network(torch.from_numpy(batch.observations))
         chosen = self.chosen(values, torch.from_numpy(batch.actions))
-        loss = nn.functional.smooth_l1_loss(chosen, targets, beta=args.huber)
+        loss = nn.functional.smooth_l1_loss(chosen, targets, beta=args.huber_delta)
         self.optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()

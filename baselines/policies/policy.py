@@ -17,9 +17,9 @@ import torch
 from baselines.networks import Network, NetworkSpec, build_network, greedy_actions
 from baselines.policies.acting import check_observations, check_rows
 from baselines.policies.settings import read_grid
-from baselines.runs.folder import CONFIG_FILE, WEIGHTS_FILE, parse_json
+from baselines.runs.folder import CONFIG_FILE, WEIGHTS_FILE
 from mapp_env import Grid
-from mapp_env.files import read_bytes, write_bytes
+from mapp_env.files import parse_json, read_bytes, write_bytes
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.validation import check_count
@@ -281,15 +281,15 @@ def read_spec(file: Path, content: bytes) -> NetworkSpec:
     if not 2 <= length <= min(MAX_HEADER_BYTES, len(content) - 8):
         raise ValueError(f"{file}: damaged weights: this is not a safetensors file")
     try:
-        header = parse_json(content[8 : 8 + length])
+        header = parse_json(content[8 : 8 + length], "the header", ValueError)
         metadata = header.get("__metadata__") if isinstance(header, dict) else None
         text = metadata.get(WEIGHTS_KEY) if isinstance(metadata, dict) else None
         if not isinstance(text, str):
             raise ValueError(f"foreign weights: the header has no {WEIGHTS_KEY!r}")
-        about = parse_json(text)
+        about = parse_json(text, WEIGHTS_KEY, ValueError)
         version = about.pop("version", None) if isinstance(about, dict) else None
         if type(version) is not int or version != WEIGHTS_VERSION:  # True and 1.0 equal 1
             raise ValueError(f"foreign weights: {WEIGHTS_KEY} is not of version {WEIGHTS_VERSION}")
         return NetworkSpec(**about)
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"{file}: {error}") from error

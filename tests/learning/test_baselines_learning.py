@@ -14,8 +14,7 @@ from baselines.independent_dqn import Args as IndependentArgs
 from baselines.independent_dqn import IndependentLearners
 from baselines.learning import q_learning as q_learner
 from baselines.learning.config import parse_options, preset_options, without_effect
-from baselines.learning.experiment import training_problems
-from baselines.learning.training import Streams, Training
+from baselines.learning.training import Streams, Training, training_problems
 from baselines.meta_dqn import Args, MetaLearner
 from baselines.networks import NetworkSpec, build_network, torch_generator
 from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
@@ -728,7 +727,7 @@ def test_training_leaves_the_global_generators_alone(preset):
         ("code_units", 0),
         ("learning_rate_warmup", -1),
         ("reward_scale", 0.0),
-        ("huber", 0.0),
+        ("huber_delta", 0.0),
         ("target_rate", 1.5),
         ("final_from", float("nan")),
         ("tried_actions", 0),

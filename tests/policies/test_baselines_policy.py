@@ -183,7 +183,7 @@ def test_a_policy_has_the_grid_that_its_config_names(tmp_path, network):
     for path in (tmp_path, tmp_path / "policy.safetensors"):
         assert load_policy(path).grid == grid
     for text, reason in (
-        ("{", "not a readable config"),
+        ("{", "is not strict JSON"),
         ("{}", "no entry 'grid'"),
         ('{"grid": "x"}', "grid: text:1"),
         ('{"grid": 7}', "grid: text must be a str"),
