@@ -127,8 +127,10 @@ class Distilled(Pupil):
             raise ValueError(f"policy must have the network {spec}, got {network.spec}")
         super().__init__(args, network, np.random.default_rng(states))
         self.states = ImaginedReplay(
-            *(spec, grid.depot, args.batch_size, 1, 1.0, 0.0),
-            *(args.from_depot, args.max_length),
+            *(spec, grid),
+            n_rows=args.batch_size,
+            from_depot=args.from_depot,
+            max_length=args.max_length,
         )
         # Here the grid may be read: the solver knows it as well.
         reached = np.append(grid.reachable, grid.depot)

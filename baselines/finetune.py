@@ -32,7 +32,7 @@ from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
-from baselines.meta_dqn import joint_values
+from baselines.learning.q_learning import joint_values
 from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
 from baselines.policies.acting import check_grid
 from baselines.policies.evaluation import (
@@ -45,7 +45,8 @@ from baselines.policies.evaluation import (
 from baselines.policies.policy import NetworkPolicy
 from baselines.policies.settings import N_ACTIONS, Setting
 from baselines.policies.trained import load_trained
-from baselines.replay.imagined import UNKNOWN, is_on, join
+from baselines.replay.imagined import UNKNOWN, join
+from baselines.replay.relabelled import RelabelledReward
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 from mapp_env.validation import check_count, check_number
 
@@ -160,6 +161,7 @@ class Tuner:
         cells = np.full((n_rows, self.spec.n_agents), problem.grid.depot)
         landmarks = np.tile(np.array(problem.landmarks), (n_rows, 1))
         visited = np.zeros(landmarks.shape, np.bool_)
+        rules = RelabelledReward(problem.grid, "step")
         seen, taken = [], []
         limit = problem.max_cycles if self.best is None else len(self.best.joint)
         for _ in range(limit or 0):
@@ -176,7 +178,7 @@ class Tuner:
             taken.append(joint)
             moved = self.moves[cells, self.digits[joint]]
             cells = np.where(going_on[:, None], moved, cells)
-            visited = visited | (is_on(cells, landmarks) & going_on[:, None])
+            visited[going_on] = rules.arrive(cells, landmarks, visited)[0][going_on]
             done = visited.all(axis=1)
             if done.any():
                 row = int(done.argmax())

@@ -146,8 +146,6 @@ class Options:
     the table and the routes"""
     checkpoint_seconds: float = 30.0
     """seconds between two checkpoints; 0 for one after every step and update"""
-    prefetch: bool = True
-    """whether the next batch is prepared in a second thread; the weights are the same"""
     half_precision: bool = False
     """keep the policy's weights in 16 bits"""
     threads: int = 1
@@ -160,7 +158,7 @@ class Options:
         check_choice("network", self.network, self.NETWORKS)
         check_choice("outputs", self.outputs, self.OUTPUTS)
         check_choice("replay", self.replay, self.REPLAYS)
-        for name in ("dueling", "double", "learning_rate_falls", "prefetch", "half_precision"):
+        for name in ("dueling", "double", "learning_rate_falls", "half_precision"):
             check_flag(name, getattr(self, name))
         for name, low, high in COUNTS:
             check_count(name, getattr(self, name), low, high)

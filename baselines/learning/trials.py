@@ -12,7 +12,7 @@ from baselines.learning.config import Options, option_name, parse_options
 from baselines.runs.folder import CONFIG_FILE, LOCK_FILE, foreign_entry, read_config
 
 EVALUATION_FILE = "evaluation.csv"  # a training writes it when it is through
-OWN_ENTRIES = ("out", "resume", "seed", "preset", "share_parameters", "threads", "prefetch")
+OWN_ENTRIES = ("out", "resume", "seed", "preset", "share_parameters", "threads")
 
 
 class Trial(NamedTuple):
@@ -86,8 +86,7 @@ def plan_trial(
     for word in words:
         if word.startswith("--") and option_name(word) in set_here:
             raise ValueError(f"{word}: set for each training by the study itself")
-    # With a process for each core a second thread gains nothing.
-    all_words = ("--seed", str(seed), "--no-prefetch", *own, *words)
+    all_words = ("--seed", str(seed), *own, *words)
     options = parse_options(kind[1], "", all_words)
     if not options.evaluation_problems:
         raise ValueError("evaluation_problems must be at least 1 to compare, got 0")
