@@ -46,8 +46,9 @@ from baselines.policies.policy import NetworkPolicy
 from baselines.policies.settings import N_ACTIONS, Setting
 from baselines.policies.trained import load_trained
 from baselines.replay.imagined import UNKNOWN, join
-from baselines.replay.relabelled import RelabelledReward
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.task import make_world
 from mapp_env.validation import check_count, check_number
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
@@ -161,7 +162,7 @@ class Tuner:
         cells = np.full((n_rows, self.spec.n_agents), problem.grid.depot)
         landmarks = np.tile(np.array(problem.landmarks), (n_rows, 1))
         visited = np.zeros(landmarks.shape, np.bool_)
-        rules = RelabelledReward(problem.grid, "step")
+        world = make_world(problem.grid, self.spec.n_agents, self.spec.n_landmarks)
         seen, taken = [], []
         limit = problem.max_cycles if self.best is None else len(self.best.joint)
         for _ in range(limit or 0):
@@ -178,7 +179,7 @@ class Tuner:
             taken.append(joint)
             moved = self.moves[cells, self.digits[joint]]
             cells = np.where(going_on[:, None], moved, cells)
-            visited[going_on] = rules.arrive(cells, landmarks, visited)[0][going_on]
+            visited[going_on] = visit_rows(world, cells, landmarks, visited)[0][going_on]
             done = visited.all(axis=1)
             if done.any():
                 row = int(done.argmax())

@@ -16,7 +16,7 @@ from baselines.learning.optimiser import optimiser_arrays, restore_optimiser
 from baselines.networks import Network, NetworkSpec
 from baselines.policies.policy import MAX_TABLE_CELLS
 from baselines.policies.settings import N_ACTIONS
-from baselines.replay.relabelled import RelabelledReward
+from baselines.replay.relabelled import RelabelledReward, relabelled_reward
 from baselines.replay.stored import Batch
 from baselines.runs.checkpoints import part
 from mapp_env import Grid
@@ -40,17 +40,19 @@ def make_goals(args: Options, grid: Grid) -> tuple[Goal, Goal]:
         If transitions are relabelled, and the grid has too many cells for a table of distances
         between all of them.
     """
-    first = Goal(RelabelledReward(grid, args.reward, args.reward_scale), args.discount)
-    if args.replay == "stored":
-        return first, first
+    sizes = grid, args.n_agents, args.n_landmarks
+    if args.replay == "stored":  # with its rewards: none is ever asked for
+        return (Goal(relabelled_reward(*sizes, "step"), args.discount),) * 2
     if grid.n_cells > MAX_TABLE_CELLS:
         raise ValueError(
             f"grid must have at most {MAX_TABLE_CELLS:,} cells for replay {args.replay!r}, got "
             f"{grid.n_cells:,}"
         )
     final = args.reward if args.final_reward == "same" else args.final_reward
-    reward = RelabelledReward(grid, final, args.final_reward_scale)
-    return first, Goal(reward, args.final_discount)
+    return (
+        Goal(relabelled_reward(*sizes, args.reward, args.reward_scale), args.discount),
+        Goal(relabelled_reward(*sizes, final, args.final_reward_scale), args.final_discount),
+    )
 
 
 def spec_from_options(args: Options, kind: str, grid: Grid, team: str = "one") -> NetworkSpec:

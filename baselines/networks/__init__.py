@@ -18,7 +18,7 @@ from baselines.networks.lookups import arrange, between_landmarks, n_routes, rou
 from mapp_env import Grid
 from mapp_env.engine.loops import observe_rows
 from mapp_env.engine.observation import N_FEATURES, Observation
-from mapp_env.engine.rules import ALL_PAIRS, cell_table
+from mapp_env.engine.task import make_world
 from mapp_env.validation import check_choice, check_count, check_flag
 
 MAX_WEIGHTS = 20_000_000  # numbers in a network: 76 MiB
@@ -320,7 +320,8 @@ class GeodesicNetwork(nn.Module):
         super().__init__()
         self.spec = spec
         grid = Grid.from_text(spec.grid)
-        self.table, self.distances = cell_table(grid), grid.distances
+        world = make_world(grid, spec.n_agents, spec.n_landmarks, observation=Observation.GEODESIC)
+        self.world = tuple(world)
         units = spec.code_units
         self.landmark = nn.Sequential(
             linear(N_FEATURES, units, generator),
@@ -346,14 +347,9 @@ class GeodesicNetwork(nn.Module):
         observe_rows(
             observations[:, : n + 2 * k].astype(np.int32),
             np.arange(n_rows),
-            n,
-            k,
-            int(Observation.GEODESIC),
-            self.table,
-            self.distances,
-            ALL_PAIRS,
             views,
             np.empty((n_rows, n, spec.n_actions), np.int8),
+            self.world,
         )
         whose = observations[:, n + 2 * k :].argmax(axis=1)
         own: np.ndarray = views[np.arange(n_rows), whose].reshape(n_rows, k, N_FEATURES)

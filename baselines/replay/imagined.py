@@ -23,6 +23,8 @@ from baselines.replay.stored import Batch
 from baselines.runs.checkpoints import take
 from mapp_env import Grid
 from mapp_env.compiled import nogil_kernel
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.task import make_world
 
 UNKNOWN = -1
 
@@ -82,7 +84,7 @@ class ImaginedReplay:
         self.n_tried = min(n_tried, n_joint)
         self.temperature, self.exploration = temperature, exploration
         self.from_depot, self.max_length, self.retries = from_depot, max_length, retries
-        self.rules = RelabelledReward(grid, "step")  # for visits, where no reward is asked for
+        self.world = make_world(grid, n, k)  # what the rules look up where no reward is asked for
         self.moves = np.full((spec.n_cells, spec.n_actions), UNKNOWN, np.int64)  # experienced
         self.cells = np.zeros((n_rows, n), np.int64)
         self.landmarks = np.zeros((n_rows, k), np.int64)
@@ -171,8 +173,9 @@ class ImaginedReplay:
         k = self.spec.n_landmarks
         landmarks[again] = self.landmarks[rows[again]]
         left = rng.integers(1, k + 1, size=len(rows))
-        visited, _ = self.rules.arrive(cells, landmarks, np.arange(k) >= left[:, None])
-        at_depot = at_depot | again | visited.all(axis=1)
+        visited = np.arange(k) >= left[:, None]
+        visited, _, over = visit_rows(self.world, cells, landmarks, visited)
+        at_depot = at_depot | again | over
         cells[at_depot], visited[at_depot] = self.depot, False
         self.cells[rows], self.landmarks[rows], self.visited[rows] = cells, landmarks, visited
         self.ages[rows] = 0
@@ -208,8 +211,11 @@ class ImaginedReplay:
         # What the others do is the same whatever the actors try.
         cells = np.repeat(self._others_move()[:, None], self.n_tried, axis=1)
         cells[:, :, self.actors] = self.moves[own[:, None], actions]
-        landmarks = self.landmarks[:, None]
-        visited, rewards = reward.arrive(cells, landmarks, self.visited[:, None])
+        landmarks = np.repeat(self.landmarks[:, None], self.n_tried, axis=1)
+        visited = np.repeat(self.visited[:, None], self.n_tried, axis=1)
+        parts = (part.reshape(-1, part.shape[-1]) for part in (cells, landmarks, visited))
+        arrived = visit_rows(reward.world, *parts)
+        visited, rewards, over = (part.reshape(n_rows, self.n_tried, -1) for part in arrived)
         scaled = self.PRODUCT(reward.scale) * rewards.astype(self.PRODUCT)
         followed = np.where(
             rng.random(n_rows) < self.exploration, rng.integers(self.n_tried, size=n_rows), 0
@@ -217,9 +223,9 @@ class ImaginedReplay:
         batch = Batch(
             observations=self.observations(),
             actions=actions,
-            rewards=scaled.astype(np.float32),
+            rewards=scaled.astype(np.float32)[:, :, 0],
             next_observations=self._observe(cells, landmarks, visited),
-            terminated=visited.all(axis=2),
+            terminated=over[:, :, 0],
         )
         rows = np.arange(n_rows)
         self.cells, self.visited = cells[rows, followed], visited[rows, followed]
@@ -235,7 +241,7 @@ class ImaginedReplay:
     def follow(self, actions: np.ndarray) -> None:
         """Let the imagined episodes go on with joint actions (rows, N) whose moves are known."""
         self.cells = self.moves[self.cells, actions]
-        self.visited, _ = self.rules.arrive(self.cells, self.landmarks, self.visited)
+        self.visited, *_ = visit_rows(self.world, self.cells, self.landmarks, self.visited)
         self.ages += 1
 
     # -- checkpoints

@@ -10,58 +10,33 @@ what they could have done instead, as a central learner does (``imagined.py``), 
 over them. The price is that their moves were meant for the landmarks that were there.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from baselines.networks import NetworkSpec
 from baselines.replay.stored import Batch, ReplayMemory
 from baselines.runs.checkpoints import take
 from mapp_env import Grid
-from mapp_env.engine.rows import Rows
-from mapp_env.engine.rules import WAIT
-from mapp_env.engine.task import Task
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.rules import Reward
+from mapp_env.engine.state import World, split
+from mapp_env.engine.task import make_world
 
 
-class RelabelledReward:
-    """What the engine's rules say of states with any landmarks.
+class RelabelledReward(NamedTuple):
+    """The team reward (R6) of states with any landmarks."""
 
-    Parameters
-    ----------
-    grid
-        The grid.
-    reward
-        Kind of the team reward (R6).
-    scale
-        What it is multiplied by, to keep values of the order of one.
-    """
+    world: World  # what the engine's rules look up
+    scale: float  # what the reward is multiplied by, to keep values of the order of one
 
-    def __init__(self, grid: Grid, reward: str, scale: float = 1.0) -> None:
-        self.grid, self.reward, self.scale = grid, reward, scale
 
-    def arrive(
-        self, cells: np.ndarray, landmarks: np.ndarray, visited: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Visit the landmarks under agents (R5) that have just moved, and reward the move (R6).
-
-        Parameters
-        ----------
-        cells, landmarks, visited
-            (..., N) cells, (..., K) cells and (..., K) flags, which are broadcast.
-
-        Returns
-        -------
-        visited, rewards
-            (..., K) bool, and (...) float64, not scaled.
-        """
-        n, k, before = cells.shape[-1], landmarks.shape[-1], cells.shape[:-1]
-        task = Task(self.grid, n, k, reward=self.reward, allow_wait=True)
-        rows = Rows(task, int(np.prod(before)), n_views=1)
-        parts = (cells, *(np.broadcast_to(part, (*before, k)) for part in (landmarks, visited)))
-        state = np.concatenate(parts, axis=-1).reshape(rows.n_rows, -1)
-        rows.state[:, : task.state_length] = state
-        # The agents are where their moves have led: there they wait.
-        rewards, *_ = rows.step(np.full((rows.n_rows, n), WAIT), np.zeros(rows.n_rows, np.bool_))
-        flags = rows.state[:, n + k : task.state_length]
-        return flags.reshape(*before, k) > 0, rewards.reshape(before)
+def relabelled_reward(
+    grid: Grid, n_agents: int, n_landmarks: int, reward: str, scale: float = 1.0
+) -> RelabelledReward:
+    """Return the reward of a kind: ``"manhattan"``, ``"geodesic"`` or ``"step"``."""
+    world = make_world(grid, n_agents, n_landmarks, Reward[reward.upper()])
+    return RelabelledReward(world, scale)
 
 
 class RelabelledReplay(ReplayMemory):
@@ -111,28 +86,27 @@ class RelabelledReplay(ReplayMemory):
         """Draw transitions, uniformly and with repetition, and give a share fresh landmarks."""
         n, k = self.spec.n_agents, self.spec.n_landmarks
         batch = self.sample(batch_size, rng)
-        before, after = batch.observations, batch.next_observations[:, 0]
-        cells, next_cells = before[:, :n].astype(np.int64), after[:, :n].astype(np.int64)
+        before, after = split(batch.observations, n, k), split(batch.next_observations[:, 0], n, k)
 
         known = np.flatnonzero(self.known)
         fresh = draw_landmarks(known, batch_size, k, rng)
-        n_visited = before[:, n + k : n + 2 * k].sum(axis=1)
         any_number = rng.integers(k, size=batch_size)
-        n_visited = np.where(rng.random(batch_size) < self.as_far, n_visited, any_number)
-        visited, _ = reward.arrive(cells, fresh, np.arange(k) < n_visited[:, None])
-        # With all of them visited, the episode would have been over.
-        relabelled = (rng.random(batch_size) < self.fresh) & ~visited.all(axis=1)
-        before[relabelled, n : n + k] = fresh[relabelled]
-        before[relabelled, n + k : n + 2 * k] = visited[relabelled]
-
-        landmarks, visited = before[:, n : n + k], before[:, n + k : n + 2 * k]
-        visited, rewards = reward.arrive(next_cells, landmarks, visited)
-        after[:, n : n + k] = landmarks
-        after[:, n + k : n + 2 * k] = visited
-        return batch._replace(
-            rewards=(np.float32(reward.scale) * rewards.astype(np.float32))[:, None],
-            terminated=visited.all(axis=1)[:, None],
+        n_visited = np.where(
+            rng.random(batch_size) < self.as_far, before.visited.sum(axis=1), any_number
         )
+        flags = np.arange(k) < n_visited[:, None]
+        flags, _, over = visit_rows(reward.world, before.cells, fresh, flags)
+        # With all of them visited, the episode would have been over.
+        relabelled = (rng.random(batch_size) < self.fresh) & ~over
+        before.landmarks[relabelled] = fresh[relabelled]
+        before.visited[relabelled] = flags[relabelled]
+
+        after.landmarks[:] = before.landmarks
+        after.visited[:], rewards, terminated = visit_rows(
+            reward.world, after.cells, after.landmarks, before.visited
+        )
+        rewards = np.float32(reward.scale) * rewards.astype(np.float32)
+        return batch._replace(rewards=rewards[:, None], terminated=terminated[:, None])
 
     def arrays_by_name(self) -> dict[str, np.ndarray]:
         """Return all that changes, for a checkpoint."""

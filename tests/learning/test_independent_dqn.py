@@ -13,7 +13,7 @@ from baselines.learning.training import Streams
 from baselines.networks import NetworkSpec, Team, build_network, torch_generator, view
 from baselines.policies.policy import WEIGHTS_KEY, load_policy, save_policy
 from baselines.policies.settings import Setting, check_fits
-from baselines.replay.relabelled import RelabelledReplay, RelabelledReward
+from baselines.replay.relabelled import RelabelledReplay, relabelled_reward
 from mapp_env import Grid, make_grid, mapp_v0
 
 LEFT, RIGHT, UP, DOWN = range(4)
@@ -300,7 +300,9 @@ def test_relabelled_transitions_obey_the_rules(reward):
         stored.add((*before[:3], action, *after[:3]))
         own.add(tuple(before[3:8]))
     assert replay.ready
-    batch = replay.relabel(2000, RelabelledReward(GRID, reward, 0.5), np.random.default_rng(1))
+    batch = replay.relabel(
+        2000, relabelled_reward(GRID, 3, 5, reward, 0.5), np.random.default_rng(1)
+    )
     distances = MANHATTAN if reward == "manhattan" else np.asarray(GRID.distances)
     kept_own = 0
     for row in range(2000):
@@ -336,7 +338,7 @@ def test_drawing_leaves_what_was_experienced_alone():
     for before, actions, _, after, _ in walk(np.random.default_rng(0), 200):
         replay.add(before, actions[:1], np.nan, after, None)
     kept = {name: array.copy() for name, array in replay.arrays_by_name().items()}
-    reward = RelabelledReward(GRID, "step")
+    reward = relabelled_reward(GRID, 3, 5, "step")
     first, second = (replay.relabel(50, reward, np.random.default_rng(3)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -560,7 +562,7 @@ def test_share_of_fresh_landmarks_visited_as_far(as_far):
         before, after = (np.array([*c, *marks], np.float32) for c in (cells, there))
         replay.add(before, actions[:1], np.nan, after, None)
         cells = there
-    batch = replay.relabel(4000, RelabelledReward(GRID, "step"), rng)
+    batch = replay.relabel(4000, relabelled_reward(GRID, 3, 5, "step"), rng)
     obs = batch.observations
     on = (obs[:, None, :3] == obs[:, 3:8, None]).any(axis=2)
     more = (obs[:, 8:] > on).any(axis=1)  # visited, though nobody stands on it

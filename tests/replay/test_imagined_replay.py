@@ -8,17 +8,11 @@ import pytest
 from baselines.networks import NetworkSpec, split_joint
 from baselines.replay.imagined import UNKNOWN, ImaginedReplay, try_actions
 from baselines.replay.own_imagined import OwnImaginedReplay
-from baselines.replay.relabelled import RelabelledReward
+from baselines.replay.relabelled import RelabelledReward, relabelled_reward
 from mapp_env import Grid, make_grid
-from mapp_env.engine.rules import (
-    ALL_PAIRS,
-    BY_COORDINATES,
-    NO_DISTANCES,
-    Reward,
-    cell_table,
-    row_length,
-    step_row,
-)
+from mapp_env.engine.rules import Reward, step_row
+from mapp_env.engine.state import new_rows, split
+from mapp_env.engine.task import make_world
 
 GRIDS = {
     "paper": make_grid("paper-7x7"),
@@ -26,7 +20,6 @@ GRIDS = {
     "rooms": Grid.from_text("....#...\n..#....#\n.#..D.#.\n...##...\n.#......"),
     "hall": Grid.from_text("......\n......\n...D..\n......"),
 }
-TABLES = {grid: cell_table(grid) for grid in GRIDS.values()}
 REWARDS = ("manhattan", "geodesic", "step")
 
 
@@ -49,6 +42,11 @@ def tell(replay, observation, actions, next_observation) -> None:
     replay.add(observation, actions, np.nan, next_observation, None)
 
 
+def rewards_for(replay: ImaginedReplay, grid: Grid, kind: str, scale: float) -> RelabelledReward:
+    """Return a reward of the replay's transitions."""
+    return relabelled_reward(grid, replay.spec.n_agents, replay.spec.n_landmarks, kind, scale)
+
+
 def experience(replay: ImaginedReplay, grid: Grid, rng: np.random.Generator, share: float) -> None:
     """Tell of moves, each with a probability, the depot's to the right or left surely."""
     n, k = replay.spec.n_agents, replay.spec.n_landmarks
@@ -69,17 +67,12 @@ def step_by_the_rules(
 ) -> tuple[np.ndarray, float, bool]:
     """Return the next observation, the reward and whether it ends, from the env's own kernel."""
     n_landmarks = (len(observation) - n_agents) // 2
-    row = np.zeros(row_length(n_agents, n_landmarks), np.int32)
-    row[: len(observation)] = observation
-    distances, first = NO_DISTANCES, BY_COORDINATES
-    if kind == "geodesic":
-        distances, first = np.array(grid.distances, np.int32), ALL_PAIRS
-        distances.flags.writeable = False
-    reward, terminated, _ = step_row(
-        row, np.array(actions), n_agents, n_landmarks, 10**6, int(Reward[kind.upper()]),
-        TABLES[grid], distances, first,
-    )  # fmt: skip
-    return row[: len(observation)].astype(np.float32), reward, terminated
+    row = new_rows(1, n_agents, n_landmarks)[0]
+    head = split(row, n_agents, n_landmarks).head
+    head[:] = observation
+    world = make_world(grid, n_agents, n_landmarks, Reward[kind.upper()])
+    reward, terminated, _ = step_row(row, np.array(actions), 10**6, world)
+    return head.astype(np.float32), reward, terminated
 
 
 def round_of(replay, reward, rng):
@@ -116,7 +109,7 @@ def test_every_imagined_transition_is_the_rules_own(name, n_agents, n_landmarks,
     rng = np.random.default_rng([n_agents, n_landmarks])
     replay = make_replay(grid, n_agents, n_landmarks, n_rows=24, from_depot=0.2)
     experience(replay, grid, rng, 1.0)
-    reward = RelabelledReward(grid, kind, scale)
+    reward = rewards_for(replay, grid, kind, scale)
     ended = 0
     for _ in range(16):
         batch, _ = round_of(replay, reward, rng)
@@ -148,7 +141,7 @@ def test_no_move_that_nobody_made_is_imagined(n_agents, share):
     made = replay.moves.copy()
     known = replay._known_cells()
     for _ in range(60):
-        batch, _ = round_of(replay, RelabelledReward(grid, "step", 1.0), rng)
+        batch, _ = round_of(replay, rewards_for(replay, grid, "step", 1.0), rng)
         cells = batch.observations[:, None, :n_agents].astype(int)
         led_to = made[cells, batch.actions]
         assert (led_to != UNKNOWN).all()
@@ -290,7 +283,7 @@ def test_only_ended_episodes_begin_anew():
     rng = np.random.default_rng(0)
     replay = make_replay(grid, 2, 2, n_rows=64, max_length=6)
     experience(replay, grid, rng, 1.0)
-    reward = RelabelledReward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
     solved = timed_out = went_on = 0
     for _ in range(40):
         ended = replay.visited.all(axis=1) | (replay.ages >= 6)
@@ -343,7 +336,7 @@ def test_episodes_stop_in_cells_without_recorded_moves():
             replay, np.array([cell, 0, 0], np.float32), np.array([action]), np.array([there, 0, 0])
         )
     rng = np.random.default_rng(0)
-    reward = RelabelledReward(GRIDS["corridor"], "step", 1.0)
+    reward = rewards_for(replay, GRIDS["corridor"], "step", 1.0)
     met = 0
     for _ in range(30):
         replay.start_over(rng)
@@ -416,7 +409,7 @@ def test_exploration_is_the_share_of_other_actions_followed():
         experience(replay, grid, rng, 1.0)
         replay.start_over(rng)
         values = np.tile(np.array([0.0, 0.1, 0.0, 0.0], np.float32), (4000, 1))
-        batch, _ = replay.draw(values, RelabelledReward(grid, "step", 1.0), rng)
+        batch, _ = replay.draw(values, rewards_for(replay, grid, "step", 1.0), rng)
         rows = np.arange(4000)
         # From the depot in the open every action leads elsewhere.
         followed = (batch.next_observations[:, :, 0] == replay.cells).argmax(axis=1)
@@ -439,7 +432,7 @@ def test_no_more_actions_are_tried_than_there_are():
 
 def play(replay: ImaginedReplay, grid: Grid, rng: np.random.Generator, rounds: int) -> list:
     """Return all arrays of some draws."""
-    reward = RelabelledReward(grid, "manhattan", 0.1)
+    reward = rewards_for(replay, grid, "manhattan", 0.1)
     return [array for _ in range(rounds) for array in round_of(replay, reward, rng)[0]]
 
 
@@ -549,7 +542,7 @@ def test_an_agent_imagines_its_own_moves_by_the_rules(
     grid = GRIDS[name]
     rng = np.random.default_rng([n_agents, n_landmarks])
     replay = make_own(grid, n_agents, n_landmarks, agent, capacity=capacity)
-    reward = RelabelledReward(grid, kind, 0.5)
+    reward = rewards_for(replay, grid, kind, 0.5)
     own, seen = set(), [set() for _ in range(n_agents)]
     ended = rounds = 0
     for step, (before, actions, after) in enumerate(walk(grid, n_agents, n_landmarks, rng, 400)):
@@ -609,7 +602,7 @@ def test_the_others_go_along_what_was_seen(capacity):
         previous = before, after
     for other in (0, 2):
         last[other].add((previous[0][other], previous[1][other]))
-    reward = RelabelledReward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
     came_from = None
     changed = 0
     for _ in range(60):
@@ -641,7 +634,7 @@ def test_where_a_stretch_ends_any_other_goes_on():
             seen[other, int(after[other])] += before[other] == grid.depot
     replay.start_over(rng)
     replay.moments[:] = UNKNOWN  # as if all had come to the depot at the end of theirs
-    batch = own_round(replay, RelabelledReward(grid, "step", 1.0), rng)
+    batch = own_round(replay, rewards_for(replay, grid, "step", 1.0), rng)
     for other in (0, 2):
         found = np.bincount(batch.next_observations[:, 0, other].astype(int), minlength=49)
         np.testing.assert_allclose(found / 4000, seen[other] / seen[other].sum(), atol=0.04)
@@ -674,7 +667,7 @@ def test_the_share_of_fresh_landmarks(fresh):
         tell(replay, before, actions[[1]], after)
         if (before[[0, 1, 2]] == grid.depot).all():
             played.setdefault((*after[[0, 2]],), set()).add(tuple(before[3:8]))
-    batch = own_round(replay, RelabelledReward(grid, "step", 1.0), rng)
+    batch = own_round(replay, rewards_for(replay, grid, "step", 1.0), rng)
     kept = [
         tuple(here[3:8]) in played[(*there[[0, 2]],)]
         for here, there in zip(batch.observations, batch.next_observations[:, 0], strict=True)
@@ -694,7 +687,7 @@ def test_own_episodes_begin_and_begin_again():
     )
     for before, actions, after in walk(grid, 3, 5, rng, 1000):
         tell(replay, before, actions[[1]], after)
-    reward = RelabelledReward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
 
     def begin():
         rows = replay.start_over(rng)
@@ -730,7 +723,7 @@ def test_own_best_action_is_tried_first_and_followed(exploration):
         tell(replay, before, actions[[1]], after)
         made[int(before[1]), actions[1]] = True
     assert not made[made.any(axis=1)].all()
-    reward = RelabelledReward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
     for _ in range(4):
         replay.start_over(rng)
         values = rng.normal(size=(2000, 4)).astype(np.float32)
@@ -750,7 +743,7 @@ def test_own_best_action_is_tried_first_and_followed(exploration):
 def test_own_restored_replay_goes_on_bit_for_bit():
     """A replay that takes over another's arrays draws what the other does, and shares none."""
     grid = GRIDS["rooms"]
-    reward = RelabelledReward(grid, "manhattan", 1.0)
+    reward = relabelled_reward(grid, 3, 2, "manhattan")
     first, rng = make_own(grid, 3, 2, 1, capacity=200), np.random.default_rng(0)
     steps = list(walk(grid, 3, 2, rng, 330))
     for before, actions, after in steps[:300]:
