@@ -55,6 +55,7 @@ from baselines.learning.config import Options, parse_options
 from baselines.learning.experiment import run_experiment
 from baselines.learning.q_learning import (
     QLearner,
+    action_values,
     chosen_values,
     imagination,
     learning_rate,
@@ -80,8 +81,6 @@ from mapp_env import Grid
 from mapp_env.validation import check_flag, check_number
 
 ALGORITHM = "independent_dqn"
-
-Replay = ReplayMemory | RelabelledReplay | OwnImaginedReplay
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,9 @@ class Args(Options):
         check_number("fresh_as_far", self.fresh_as_far, 0.0, 1.0)
 
 
-def make_replay(args: Args, grid: Grid, spec: NetworkSpec, agent: int, n_sources: int) -> Replay:
+def make_replay(
+    args: Args, grid: Grid, spec: NetworkSpec, agent: int, n_sources: int
+) -> ReplayMemory | OwnImaginedReplay:
     """Build the memory of what an agent did, or of what several did that share a network."""
     # Of each agent, as many transitions as are kept of it when it learns alone.
     capacity = n_sources * args.memory_size
@@ -134,8 +135,6 @@ def make_replay(args: Args, grid: Grid, spec: NetworkSpec, agent: int, n_sources
 
 class AgentLearner(QLearner):
     """One agent's network, or one that all share, and what it learns with."""
-
-    replay: Replay
 
     @torch.no_grad()
     def sample(self, progress: float) -> tuple[Batch, Tensor]:
@@ -155,10 +154,8 @@ class AgentLearner(QLearner):
 
         # The targets: the reward, and the best that can follow.
         next_obs = torch.from_numpy(batch.next_observations)
-        values = self.target(next_obs.flatten(0, 1)).unflatten(0, next_obs.shape[:2])
-        chooser = values
-        if args.double:
-            chooser = self.network(next_obs.flatten(0, 1)).unflatten(0, next_obs.shape[:2])
+        values = action_values(self.target, next_obs)
+        chooser = action_values(self.network, next_obs) if args.double else values
         best = next_values(values, chooser, replay.known_actions(batch.next_observations))
         if here is not None:
             # No reward of the rules is above 0, so no value is. Without this bound the values of

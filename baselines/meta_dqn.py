@@ -41,6 +41,7 @@ from baselines.learning.config import Options, parse_options
 from baselines.learning.experiment import run_experiment
 from baselines.learning.q_learning import (
     QLearner,
+    action_values,
     chosen_values,
     imagination,
     joint_values,
@@ -79,8 +80,6 @@ def make_replay(args: Args, grid: Grid, spec: NetworkSpec) -> ReplayMemory | Ima
 
 class MetaLearner(QLearner):
     """The network of all agents, and what it learns with."""
-
-    replay: ReplayMemory | ImaginedReplay
 
     def __init__(self, args: Args, grid: Grid, streams: Streams) -> None:
         spec = spec_from_options(args, args.network, grid)
@@ -126,10 +125,8 @@ class MetaLearner(QLearner):
 
         # The targets: the reward, and the best that can follow.
         next_obs = torch.from_numpy(batch.next_observations)
-        values = self.target(next_obs.flatten(0, 1)).unflatten(0, next_obs.shape[:2])
-        chooser = values
-        if args.double:
-            chooser = self.network(next_obs.flatten(0, 1)).unflatten(0, next_obs.shape[:2])
+        values = action_values(self.target, next_obs)
+        chooser = action_values(self.network, next_obs) if args.double else values
         best = next_values(values, chooser, replay.known_actions(batch.next_observations))
         rewards, terminated = map(torch.from_numpy, (batch.rewards, batch.terminated))
         targets = td_targets(rewards, terminated, best, goal.discount)

@@ -5,7 +5,7 @@ acts, stores, samples and learns stands in its script: ``meta_dqn.py``, ``indepe
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +16,9 @@ from baselines.learning.optimiser import optimiser_arrays, restore_optimiser
 from baselines.networks import Network, NetworkSpec
 from baselines.policies.policy import MAX_TABLE_CELLS
 from baselines.policies.settings import N_ACTIONS
+from baselines.replay.imagined import ImaginedReplay
 from baselines.replay.relabelled import RelabelledReward, relabelled_reward
-from baselines.replay.stored import Batch
+from baselines.replay.stored import Batch, ReplayMemory
 from baselines.runs.checkpoints import part
 from mapp_env import Grid
 
@@ -88,6 +89,12 @@ def imagination(args: Options) -> dict[str, Any]:
 
 
 # -- values of actions -------------------------------------------------------------------------
+
+
+def action_values(network: Network, observations: Tensor) -> Tensor:
+    """Return a network's values (B, T, ...) of observations (B, T, D)."""
+    values: Tensor = network(observations.flatten(0, 1))
+    return values.unflatten(0, observations.shape[:2])
 
 
 def chosen_values(values: Tensor, actions: Tensor, spec: NetworkSpec) -> Tensor:
@@ -190,18 +197,6 @@ def move_target(target: Network, network: Network, args: Options, updates: int) 
 # -- what a learner holds ----------------------------------------------------------------------
 
 
-class Replay(Protocol):
-    """What is learned from."""
-
-    def arrays_by_name(self) -> dict[str, np.ndarray]:
-        """Return all that changes, for a checkpoint."""
-        ...
-
-    def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Take over what :meth:`arrays_by_name` returned."""
-        ...
-
-
 class QLearner:
     """A network, its target network, optimiser and random numbers; and their checkpoints.
 
@@ -225,7 +220,7 @@ class QLearner:
         grid: Grid,
         network: Network,
         target: Network,
-        replay: Replay,
+        replay: ReplayMemory | ImaginedReplay,
         rng: np.random.Generator,
     ) -> None:
         self.args, self.network, self.target = args, network, target
