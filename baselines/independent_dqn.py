@@ -52,15 +52,14 @@ from baselines.learning.q_learning import Goal, QLearner, next_values, td_target
 from baselines.learning.training import Streams
 from baselines.networks import (
     Network,
-    NetworkSpec,
     Team,
     build_network,
     greedy_actions,
+    spec_from_options,
     torch_generator,
     view,
 )
 from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import N_ACTIONS
 from baselines.replay.own_imagined import OwnImaginedReplay
 from baselines.replay.relabelled import RelabelledReplay
 from baselines.replay.stored import Batch, ReplayMemory
@@ -114,22 +113,8 @@ class Args(Options):
 
 def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Team:
     """Build the networks of all agents."""
-    spec = NetworkSpec(
-        kind=args.network,
-        n_agents=args.n_agents,
-        n_landmarks=args.n_landmarks,
-        n_actions=N_ACTIONS,
-        n_cells=grid.n_cells,
-        hidden_units=args.hidden_units,
-        outputs=args.outputs,
-        dueling=args.dueling,
-        code_units=args.code_units,
-        landmark_units=args.landmark_units,
-        route_units=args.route_units,
-        team="shared" if args.share_parameters else "independent",
-        grid=grid.to_text() if args.network == "geodesic" else "",
-    )
-    team = build_network(spec, generator)
+    kind = "shared" if args.share_parameters else "independent"
+    team = build_network(spec_from_options(args, args.network, grid, team=kind), generator)
     assert isinstance(team, Team)
     return team
 

@@ -39,10 +39,10 @@ from baselines.networks import (
     NetworkSpec,
     build_network,
     greedy_actions,
+    spec_from_options,
     torch_generator,
 )
 from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import N_ACTIONS
 from baselines.replay.imagined import ImaginedReplay
 from baselines.replay.stored import Batch, ReplayMemory
 from baselines.runs.checkpoints import take
@@ -65,20 +65,7 @@ class Args(Options):
 
 def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Network:
     """Build the network that commands all agents."""
-    spec = NetworkSpec(
-        kind=args.network,
-        n_agents=args.n_agents,
-        n_landmarks=args.n_landmarks,
-        n_actions=N_ACTIONS,
-        n_cells=grid.n_cells,
-        hidden_units=args.hidden_units,
-        outputs=args.outputs,
-        dueling=args.dueling,
-        code_units=args.code_units,
-        landmark_units=args.landmark_units,
-        route_units=args.route_units,
-    )
-    return build_network(spec, generator)
+    return build_network(spec_from_options(args, args.network, grid), generator)
 
 
 # -- loss --------------------------------------------------------------------------------------

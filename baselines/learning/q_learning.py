@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from baselines.learning.config import Options
 from baselines.learning.optimiser import optimiser_arrays, restore_optimiser
 from baselines.networks import Network
-from baselines.policies.policy import MAX_TABLE_CELLS
 from baselines.replay.imagined import RelabelledReward, relabelled_reward
 from baselines.replay.stored import Batch
 from baselines.runs.checkpoints import part
 from mapp_env import Grid
+from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 
 
 class Goal(NamedTuple):
@@ -37,9 +37,9 @@ def make_goals(args: Options, grid: Grid) -> tuple[Goal, ...]:
     ValueError
         If the grid has too many cells for a table of distances between all of them.
     """
-    if grid.n_cells > MAX_TABLE_CELLS:
+    if grid.n_cells > MAX_ALL_PAIRS_CELLS:
         raise ValueError(
-            f"grid must have at most {MAX_TABLE_CELLS:,} cells for replay {args.replay!r}, got "
+            f"grid must have at most {MAX_ALL_PAIRS_CELLS:,} cells for replay {args.replay!r}, got "
             f"{grid.n_cells:,}"
         )
     final = args.reward if args.final_reward == "same" else args.final_reward

@@ -16,7 +16,7 @@ those of the agent's own best play beside others who behave as they did.
 
 import numpy as np
 
-from baselines.networks import NetworkSpec, view
+from baselines.networks import NetworkSpec, network_spec, view
 from baselines.replay.imagined import (
     UNKNOWN,
     ImaginedReplay,
@@ -69,7 +69,7 @@ class OwnImaginedReplay(ImaginedReplay):
         max_length: int,
         retries: float = 0.0,
     ) -> None:
-        alone = NetworkSpec("paper", 1, spec.n_landmarks, spec.n_actions, spec.n_cells, 1)
+        alone = network_spec("paper", 1, spec.n_landmarks, spec.n_actions, spec.n_cells, 1)
         super().__init__(
             alone,
             depot,
