@@ -276,7 +276,7 @@ def starting_point(policy: str | Path | None) -> PolicyOfRun:
 
 
 def train(
-    pupil: Pupil, grid: Grid, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals
+    pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals, grid: Grid
 ) -> None:
     """Teach until all updates are done, or a signal comes; then leave a checkpoint."""
     args = pupil.args
@@ -347,7 +347,7 @@ def run_imitation(
             if not checkpoints.numbers():
                 # What it starts from, to the bit: it may have to start again.
                 save_policy(run.path(WEIGHTS_FILE), pupil.network, setting.grid)
-            train(pupil, setting.grid, run, checkpoints, signals)
+            train(pupil, run, checkpoints, signals, setting.grid)
         if signals.received is not None:
             raise KeyboardInterrupt
         if n_evaluated:

@@ -35,7 +35,7 @@ class GeodesicSpec(NetworkSpec):
         try:
             super().check_grid(Grid.from_text(self.grid))
         except ValueError as error:
-            raise ValueError(f"grid must be a map of the network's cells: {error}") from error
+            raise ValueError(f"grid must be a map, got {self.grid!r}: {error}") from error
 
     def check_grid(self, grid: Grid | None) -> None:
         """Refuse any grid but the one whose paths are seen."""
