@@ -61,7 +61,6 @@ from baselines.learning.q_learning import (
     learning_rate,
     move_target,
     next_values,
-    spec_from_options,
     td_targets,
 )
 from baselines.learning.training import Streams
@@ -69,6 +68,7 @@ from baselines.networks import (
     NetworkSpec,
     build_network,
     greedy_actions,
+    spec_from_options,
     torch_generator,
     view,
 )

@@ -48,11 +48,16 @@ from baselines.learning.q_learning import (
     learning_rate,
     move_target,
     next_values,
-    spec_from_options,
     td_targets,
 )
 from baselines.learning.training import Streams
-from baselines.networks import NetworkSpec, build_network, greedy_actions, torch_generator
+from baselines.networks import (
+    NetworkSpec,
+    build_network,
+    greedy_actions,
+    spec_from_options,
+    torch_generator,
+)
 from baselines.policies.policy import NetworkPolicy
 from baselines.replay.imagined import ImaginedReplay
 from baselines.replay.stored import Batch, ReplayMemory

@@ -23,19 +23,18 @@ from baselines.policies.evaluation import (
     EVALUATION_SEED,
     N_ROUTES,
     Evaluation,
-    Setting,
     count_unseen,
     evaluate,
     find_optima,
     format_table,
     out_of_reach,
-    rules_of_thumb,
     save_table,
     unseen_problems,
 )
 from baselines.policies.guidance import Guidance, GuidedPolicy
-from baselines.policies.policy import NetworkPolicy, RandomPolicy, save_policy
-from baselines.policies.settings import N_ACTIONS, read_setting
+from baselines.policies.policy import NetworkPolicy, save_policy
+from baselines.policies.rules_of_thumb import RandomPolicy, rules_of_thumb
+from baselines.policies.settings import N_ACTIONS, Setting, read_setting
 from baselines.runs.checkpoints import Checkpoints, go_on, save
 from baselines.runs.folder import (
     METRICS_FILE,
@@ -65,11 +64,17 @@ def training_problems(args: Options, grid: Grid) -> np.ndarray:
     )
 
 
+def keep_weights(training: Training, run: RunFolder) -> None:
+    """Write the weights of the policy that is learned, for the grid it is learned on."""
+    network, grid = training.learner.policy().network, training.guidance.grid
+    save_policy(run.path(WEIGHTS_FILE), network, grid, training.args.half_precision)
+
+
 def train(
     training: Training, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals
 ) -> None:
     """Train until all episodes are over, or a signal comes; then leave a checkpoint."""
-    args, learner = training.args, training.learner
+    args = training.args
     if not checkpoints.numbers():
         save(run, checkpoints, training)
     progress = tqdm(
@@ -87,7 +92,7 @@ def train(
             progress.set_postfix(steps=row["steps"], reward=f"{reward:.0f}")
             progress.update()
             if training.now.episodes % args.episodes_per_problem == 0:
-                save_policy(run.path(WEIGHTS_FILE), learner.policy().network, args.half_precision)
+                keep_weights(training, run)
             training.watch.lap("log and save")
         if time.monotonic() - saved >= args.checkpoint_seconds:
             save(run, checkpoints, training)
@@ -95,14 +100,14 @@ def train(
             saved = time.monotonic()
     progress.close()
     save(run, checkpoints, training)
-    save_policy(run.path(WEIGHTS_FILE), learner.policy().network, args.half_precision)
+    keep_weights(training, run)
     training.watch.lap("log and save")
     run.write_json(
         TIMING_FILE,
         {
             "episodes": training.now.episodes,
             "steps": training.now.steps,
-            "updates": learner.updates,
+            "updates": training.learner.updates,
             "seconds": {name: round(s, 3) for name, s in training.watch.seconds.items()},
             "seconds_total": round(training.watch.total, 3),
         },

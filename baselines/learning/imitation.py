@@ -29,13 +29,12 @@ from baselines.policies.evaluation import (
     evaluate,
     find_optima,
     format_table,
-    rules_of_thumb,
     save_table,
     unseen_problems,
 )
 from baselines.policies.policy import load_policy, save_policy
-from baselines.policies.settings import Setting
-from baselines.policies.trained import Trained, load_trained
+from baselines.policies.rules_of_thumb import rules_of_thumb
+from baselines.policies.settings import PolicyOfRun, Setting, load_run
 from baselines.runs.checkpoints import Checkpoints, go_on, part, save
 from baselines.runs.folder import (
     TIMING_FILE,
@@ -45,6 +44,7 @@ from baselines.runs.folder import (
     default_folder,
     read_config,
 )
+from mapp_env import Grid
 from mapp_env.validation import check_count, check_flag, check_number
 
 METRICS = ("updates", "loss")
@@ -262,7 +262,7 @@ def start_of(resume: Path | None, policy: str | Path | None) -> str | Path | Non
     return resume if own else policy
 
 
-def starting_point(policy: str | Path | None) -> Trained:
+def starting_point(policy: str | Path | None) -> PolicyOfRun:
     """Return the meta-agent that a training starts from.
 
     Raises
@@ -272,10 +272,12 @@ def starting_point(policy: str | Path | None) -> Trained:
     """
     if policy is None:
         raise ValueError("policy must be the run folder of a trained meta-agent, got none")
-    return load_trained(policy)
+    return load_run(policy)
 
 
-def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals) -> None:
+def train(
+    pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals, grid: Grid
+) -> None:
     """Teach until all updates are done, or a signal comes; then leave a checkpoint."""
     args = pupil.args
     if not checkpoints.numbers():
@@ -293,7 +295,7 @@ def train(pupil: Pupil, run: RunFolder, checkpoints: Checkpoints, signals: StopS
             saved = time.monotonic()
     bar.close()
     save(run, checkpoints, pupil)
-    save_policy(run.path(WEIGHTS_FILE), pupil.network, args.half_precision)
+    save_policy(run.path(WEIGHTS_FILE), pupil.network, grid, args.half_precision)
     run.write_json(
         TIMING_FILE, {"updates": pupil.updates, "seconds_total": round(pupil.seconds, 3)}
     )
@@ -344,8 +346,8 @@ def run_imitation(
                 print(f"going on from update {pupil.updates + 1:,}")
             if not checkpoints.numbers():
                 # What it starts from, to the bit: it may have to start again.
-                save_policy(run.path(WEIGHTS_FILE), pupil.network)
-            train(pupil, run, checkpoints, signals)
+                save_policy(run.path(WEIGHTS_FILE), pupil.network, setting.grid)
+            train(pupil, run, checkpoints, signals, setting.grid)
         if signals.received is not None:
             raise KeyboardInterrupt
         if n_evaluated:

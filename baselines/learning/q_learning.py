@@ -14,13 +14,12 @@ from torch import Tensor
 from baselines.learning.config import Options
 from baselines.learning.optimiser import optimiser_arrays, restore_optimiser
 from baselines.networks import Network, NetworkSpec
-from baselines.policies.policy import MAX_TABLE_CELLS
-from baselines.policies.settings import N_ACTIONS
 from baselines.replay.imagined import ImaginedReplay
 from baselines.replay.relabelled import RelabelledReward, relabelled_reward
 from baselines.replay.stored import Batch, ReplayMemory
 from baselines.runs.checkpoints import part
 from mapp_env import Grid
+from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 
 # -- what is learned, and with what -----------------------------------------------------------
 
@@ -44,34 +43,15 @@ def make_goals(args: Options, grid: Grid) -> tuple[Goal, Goal]:
     sizes = grid, args.n_agents, args.n_landmarks
     if args.replay == "stored":  # with its rewards: none is ever asked for
         return (Goal(relabelled_reward(*sizes, "step"), args.discount),) * 2
-    if grid.n_cells > MAX_TABLE_CELLS:
+    if grid.n_cells > MAX_ALL_PAIRS_CELLS:
         raise ValueError(
-            f"grid must have at most {MAX_TABLE_CELLS:,} cells for replay {args.replay!r}, got "
+            f"grid must have at most {MAX_ALL_PAIRS_CELLS:,} cells for replay {args.replay!r}, got "
             f"{grid.n_cells:,}"
         )
     final = args.reward if args.final_reward == "same" else args.final_reward
     return (
         Goal(relabelled_reward(*sizes, args.reward, args.reward_scale), args.discount),
         Goal(relabelled_reward(*sizes, final, args.final_reward_scale), args.final_discount),
-    )
-
-
-def spec_from_options(args: Options, kind: str, grid: Grid, team: str = "one") -> NetworkSpec:
-    """Return what is needed to build a kind of network for a grid, or those of a team."""
-    return NetworkSpec(
-        kind=kind,
-        n_agents=args.n_agents,
-        n_landmarks=args.n_landmarks,
-        n_actions=N_ACTIONS,
-        n_cells=grid.n_cells,
-        hidden_units=args.hidden_units,
-        outputs=args.outputs,
-        dueling=args.dueling,
-        code_units=args.code_units,
-        landmark_units=args.landmark_units,
-        route_units=args.route_units,
-        team=team,
-        grid=grid.to_text() if kind == "geodesic" else "",
     )
 
 

@@ -17,7 +17,7 @@ from baselines.learning.config import parse_options, preset_options, without_eff
 from baselines.learning.experiment import training_problems
 from baselines.learning.training import Streams, Training
 from baselines.meta_dqn import Args, MetaLearner
-from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.networks import build_network, network_spec, torch_generator
 from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
 from baselines.replay.stored import Batch, ReplayMemory
 from mapp_env import Grid, make_grid
@@ -34,7 +34,7 @@ def paper_learner(seed: int, n_agents: int, **changes: object) -> MetaLearner:
 
 
 def small_network(n_agents: int, seed: int, hidden_units: int = 64):
-    spec = NetworkSpec("paper", n_agents, 1, 4, 9, hidden_units)
+    spec = network_spec("paper", n_agents, 1, 4, 9, hidden_units)
     return build_network(spec, torch_generator(np.random.SeedSequence(seed)))
 
 

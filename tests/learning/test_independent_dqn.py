@@ -10,8 +10,14 @@ import torch
 from baselines.independent_dqn import Args, IndependentLearners
 from baselines.learning.config import preset_options
 from baselines.learning.training import Streams
-from baselines.networks import NetworkSpec, Team, build_network, torch_generator, view
-from baselines.policies.policy import WEIGHTS_KEY, load_policy, save_policy
+from baselines.networks import Team, build_network, network_spec, torch_generator, view
+from baselines.policies.policy import (
+    WEIGHTS_KEY,
+    NetworkPolicy,
+    header,
+    load_policy,
+    save_policy,
+)
 from baselines.policies.settings import Setting, check_fits
 from baselines.replay.relabelled import RelabelledReplay, relabelled_reward
 from mapp_env import Grid, make_grid, mapp_v0
@@ -132,7 +138,7 @@ def test_shared_parameters(preset):
 @pytest.mark.parametrize("team", ["independent", "shared"])
 def test_agents_on_one_cell_can_part(kind, team):
     """Where all stand on the depot each agent has values of its own."""
-    spec = NetworkSpec(kind, 3, 5, 4, 49, 16, team=team)
+    spec = network_spec(kind, 3, 5, 4, 49, 16, team=team)
     network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
     obs = torch.tensor([[24.0, 24, 24, 0, 6, 20, 42, 48, 0, 0, 0, 0, 0]])
     with torch.no_grad():
@@ -288,7 +294,7 @@ def test_targets_of_own_imagined_moves(network, gap):
 @pytest.mark.parametrize("reward", ["manhattan", "geodesic", "step"])
 def test_relabelled_transitions_obey_the_rules(reward):
     """Moves are those that were made; flags, reward and end are those of the landmarks given."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    spec = network_spec("pairs", 3, 5, 4, 49, 16, team="independent")
     replay = RelabelledReplay(spec, GRID.depot, 1000, fresh=0.8, as_far=0.5)
     stored, own = set(), set()
     for before, actions, _, after, _ in walk(np.random.default_rng(0), 1200):
@@ -333,7 +339,7 @@ def test_relabelled_transitions_obey_the_rules(reward):
 
 def test_drawing_leaves_what_was_experienced_alone():
     """Relabelling changes copies; equal generators draw equal batches."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    spec = network_spec("pairs", 3, 5, 4, 49, 16, team="independent")
     replay = RelabelledReplay(spec, GRID.depot, 300, fresh=1.0, as_far=0.5)
     for before, actions, _, after, _ in walk(np.random.default_rng(0), 200):
         replay.add(before, actions[:1], np.nan, after, None)
@@ -382,7 +388,9 @@ def test_a_network_sees_the_geodesic_observation(team, size):
     """Each agent's network makes of the global observation what the env shows that agent."""
     grid = make_grid("random", rows=6, cols=9, density=0.2, seed=3)
     n_agents, n_landmarks = size
-    spec = NetworkSpec("geodesic", n_agents, n_landmarks, 4, 54, 16, team=team, grid=grid.to_text())
+    spec = network_spec(
+        "geodesic", n_agents, n_landmarks, 4, 54, 16, team=team, grid=grid.to_text()
+    )
     members = build_network(spec).members
     env = mapp_v0.parallel_env(
         grid=grid, n_agents=n_agents, n_landmarks=n_landmarks, observation="geodesic"
@@ -393,7 +401,7 @@ def test_a_network_sees_the_geodesic_observation(team, size):
         while env.agents:
             for agent, name in enumerate(env.agents):
                 given = view(env.state()[None], agent, spec)
-                found = members[agent % len(members)].paths(given)
+                (found,) = members[agent % len(members)].paths(given)
                 np.testing.assert_array_equal(found.ravel(), obs[name])
             actions = rng.integers(4, size=n_agents).tolist()
             obs, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
@@ -401,7 +409,7 @@ def test_a_network_sees_the_geodesic_observation(team, size):
 
 def test_landmarks_are_a_set_to_the_geodesic_network():
     """To rename landmarks changes nothing, nor does it matter where the visited ones stand."""
-    spec = NetworkSpec("geodesic", 3, 5, 4, 49, 16, team="independent", grid=GRID.to_text())
+    spec = network_spec("geodesic", 3, 5, 4, 49, 16, team="independent", grid=GRID.to_text())
     network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
     obs, rng = observations(40), np.random.default_rng(1)
     obs[:, :8] = rng.choice(GRID.reachable, (40, 8))
@@ -422,61 +430,44 @@ def test_landmarks_are_a_set_to_the_geodesic_network():
     ("changes", "message"),
     [
         ({"grid": ""}, "grid must be a map, got ''"),
-        ({"grid": "D..\n..."}, "grid must have n_cells=49 cells, got 6"),
+        ({"grid": "D..\n..."}, "grid must have the network's 49 cells, got one of 6"),
         ({"n_cells": 5000}, "n_cells must be an integer in 2..4096, got 5000"),
         ({"team": "one"}, "team must be one of 'independent', 'shared'; got 'one'"),
-        ({"kind": "pairs"}, "grid must be '' for kind 'pairs', got"),
     ],
 )
 def test_a_network_on_paths_carries_its_grid(changes, message):
-    """The grid is that of the weights, and only that of a network that needs one."""
+    """It has the network's number of cells, and paths for each agent by itself."""
     right = {"kind": "geodesic", "team": "independent", "grid": GRID.to_text()}
     with pytest.raises(ValueError, match=message):
-        NetworkSpec(**{**right, "n_agents": 3, "n_landmarks": 5, "n_actions": 4, "n_cells": 49,
+        network_spec(**{**right, "n_agents": 3, "n_landmarks": 5, "n_actions": 4, "n_cells": 49,
                        "hidden_units": 8, **changes})  # fmt: skip
 
 
 def test_only_a_network_on_paths_says_its_grid():
-    """What is saved with any other network is what it was before there were such."""
+    """Any other network has no such field."""
     assert "grid" not in make("default").spec.as_dict()
+    with pytest.raises(TypeError, match="grid"):
+        network_spec("pairs", 3, 5, 4, 49, 8, grid=GRID.to_text())
     spec = make("default", **GEODESIC).spec
-    assert NetworkSpec(**spec.as_dict()) == spec
+    assert network_spec(**spec.as_dict()) == spec
 
 
 def test_a_run_on_another_grid_than_its_weights_is_refused(tmp_path):
     """Walls elsewhere, with as many cells: the paths would be wrong."""
-    spec = make("default", **GEODESIC).spec
-    check_fits(spec, Setting(GRID), tmp_path)
+    policy = NetworkPolicy(make("default", **GEODESIC).network, GRID)
+    check_fits(policy, Setting(GRID), tmp_path)
     text = GRID.to_text().replace("#", ".", 1)
     with pytest.raises(ValueError, match="the grid is another one"):
-        check_fits(spec, Setting(Grid.from_text(text)), tmp_path)
+        check_fits(policy, Setting(Grid.from_text(text)), tmp_path)
 
 
 # -- saved teams -------------------------------------------------------------------------------
-
-
-SPECS = [
-    NetworkSpec(kind, 3, 5, 4, 49, 16, dueling=dueling, code_units=8, team=team)
-    for kind in ("paper", "pairs")
-    for team in ("one", "independent", "shared")
-    for dueling in (False, True)
-] + [
-    NetworkSpec("geodesic", 3, 5, 4, 49, 16, code_units=8, team=team, grid=GRID.to_text())
-    for team in ("independent", "shared")
-]
 
 
 def observations(n: int) -> np.ndarray:
     rng = np.random.default_rng(0)
     cells, flags = rng.integers(49, size=(n, 8)), rng.integers(2, size=(n, 5))
     return np.concatenate([cells, flags], axis=1).astype(np.float32)
-
-
-@pytest.mark.parametrize("spec", SPECS, ids=lambda s: f"{s.kind}-{s.team}-{s.dueling}")
-def test_spec_counts_the_weights(spec):
-    """The number that is capped is the number there is, and each network counts once."""
-    network = build_network(spec)
-    assert spec.n_weights == sum(weights.numel() for weights in network.parameters())
 
 
 @pytest.mark.parametrize(
@@ -486,7 +477,7 @@ def test_spec_counts_the_weights(spec):
 def test_loaded_team_acts_as_the_learners_do(tmp_path, preset, changes, share):
     """One file holds the networks of all agents, and gives the same actions."""
     team = make(preset, share_parameters=share, **changes)
-    save_policy(tmp_path / "policy.safetensors", team.policy().network)
+    save_policy(tmp_path / "policy.safetensors", team.policy().network, GRID)
     loaded = load_policy(tmp_path)
     assert loaded.spec == team.spec
     assert isinstance(loaded.network, Team)
@@ -505,11 +496,11 @@ def test_damaged_teams_are_refused_by_name(tmp_path):
     """A member that is missing, too many, of another shape or not finite is named."""
     team = make("paper").policy().network
     good = {name: tensor.clone() for name, tensor in team.state_dict().items()}
-    about = {"version": 1, **team.spec.as_dict()}
+    about = header(team.spec, GRID)
     path = tmp_path / "w"
 
     def write(tensors, **changes):
-        text = json.dumps({**about, **changes})
+        text = json.dumps({**about, "network": {**about["network"], **changes}})
         path.write_bytes(safetensors.torch.save(tensors, {WEIGHTS_KEY: text}))
 
     write({**good, "members.1.layers.0.bias": torch.full((16,), float("nan"))})
@@ -537,21 +528,10 @@ def test_damaged_teams_are_refused_by_name(tmp_path):
         load_policy(path)
 
 
-def test_weights_without_a_team_are_of_one_network(tmp_path):
-    """Files written before there were teams are read as they were meant."""
-    spec = NetworkSpec("paper", 3, 5, 4, 49, 16)
-    network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
-    about = {"version": 1, **spec.as_dict()}
-    del about["team"]
-    content = safetensors.torch.save(network.state_dict(), {WEIGHTS_KEY: json.dumps(about)})
-    (tmp_path / "w").write_bytes(content)
-    assert load_policy(tmp_path / "w").spec == spec
-
-
 @pytest.mark.parametrize("as_far", [0.0, 0.2, 1.0])
 def test_share_of_fresh_landmarks_visited_as_far(as_far):
     """As many are visited as were in just that share of what is drawn; else any number may be."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    spec = network_spec("pairs", 3, 5, 4, 49, 16, team="independent")
     replay = RelabelledReplay(spec, GRID.depot, 400, fresh=1.0, as_far=as_far)
     moves = np.asarray(GRID.moves)
     rng, cells = np.random.default_rng(0), np.full(3, GRID.depot)

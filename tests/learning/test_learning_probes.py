@@ -12,7 +12,7 @@ from baselines.learning.config import preset_options
 from baselines.learning.q_learning import chosen_values, joint_values, next_values, td_targets
 from baselines.learning.training import Streams, Training
 from baselines.meta_dqn import Args, MetaLearner
-from baselines.networks import NetworkSpec
+from baselines.networks import network_spec
 from mapp_env import Grid
 from mapp_env.engine.rules import step_row
 from mapp_env.engine.state import new_rows, split
@@ -411,13 +411,13 @@ def test_chosen_values_by_hand(n_agents):
     """The value of joint action (a, b, c) stands at 16 a + 4 b + c; agents have theirs apart."""
     rng = np.random.default_rng(n_agents)
     actions = rng.integers(4, size=(6, 5, n_agents))
-    spec = NetworkSpec("paper", n_agents, 1, 4, 9, 8, outputs="joint")
+    spec = network_spec("paper", n_agents, 1, 4, 9, 8, outputs="joint")
     values = rng.normal(size=(6, 4**n_agents)).astype(np.float32)
     chosen = chosen_values(torch.from_numpy(values), torch.from_numpy(actions), spec)
     for state, tried in product(range(6), range(5)):
         place = int("".join(map(str, actions[state, tried])), 4)
         assert chosen[state, tried].item() == values[state, place]
-    spec = NetworkSpec("paper", n_agents, 1, 4, 9, 8, outputs="agents")
+    spec = network_spec("paper", n_agents, 1, 4, 9, 8, outputs="agents")
     values = rng.normal(size=(6, n_agents, 4)).astype(np.float32)
     chosen = chosen_values(torch.from_numpy(values), torch.from_numpy(actions), spec)
     for state, tried, agent in product(range(6), range(5), range(n_agents)):
@@ -429,11 +429,11 @@ def test_chosen_values_by_hand(n_agents):
 def test_joint_values_of_agents_are_their_sums():
     """What a joint action is worth to agents with values of their own is the sum of them."""
     values = torch.tensor([[[1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 30.0, 40.0], [0.1, 0.2, 0.3, 0.4]]])
-    whole = joint_values(values, NetworkSpec("paper", 3, 1, 4, 9, 8))[0]
+    whole = joint_values(values, network_spec("paper", 3, 1, 4, 9, 8))[0]
     for a, b, c in product(range(4), repeat=3):
         expected = (a + 1) + 10 * (b + 1) + 0.1 * (c + 1)
         assert whole[16 * a + 4 * b + c].item() == pytest.approx(expected, abs=1e-5)
-    spec = NetworkSpec("paper", 3, 1, 4, 9, 8, outputs="joint")
+    spec = network_spec("paper", 3, 1, 4, 9, 8, outputs="joint")
     assert joint_values(whole, spec) is whole
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from baselines import repair, self_improve
-from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
+from baselines.networks import build_network, network_spec, split_joint, torch_generator
 from baselines.policies.evaluation import evaluate, every_problem
 from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
 from baselines.policies.settings import Setting
@@ -31,7 +31,7 @@ SMALL = {
 
 def untrained(outputs: str = "joint"):
     """Return a network that has learned nothing."""
-    spec = NetworkSpec("pairs", 2, 2, 4, 16, 32, outputs, dueling=True, code_units=16)
+    spec = network_spec("pairs", 2, 2, 4, 16, 32, outputs, dueling=True, code_units=16)
     return build_network(spec, torch_generator(np.random.SeedSequence(0)))
 
 
@@ -45,7 +45,7 @@ def unsolved(network) -> np.ndarray:
 def folder(tmp_path_factory):
     """Return a run folder with a policy that solves most problems, not all."""
     start, path = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("trained") / "run"
-    save_policy(start / "policy.safetensors", untrained())
+    save_policy(start / "policy.safetensors", untrained(), GRID)
     config = {
         "options": {"n_agents": 2, "n_landmarks": 2, "max_cycles": 20},
         "grid": GRID.to_text(),

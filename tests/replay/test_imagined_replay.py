@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from baselines.networks import NetworkSpec, split_joint
+from baselines.networks import network_spec, split_joint
 from baselines.replay.imagined import UNKNOWN, ImaginedReplay, try_actions
 from baselines.replay.own_imagined import OwnImaginedReplay
 from baselines.replay.relabelled import RelabelledReward, relabelled_reward
@@ -25,7 +25,7 @@ REWARDS = ("manhattan", "geodesic", "step")
 
 def make_replay(grid: Grid, n_agents: int, n_landmarks: int, **changes: object) -> ImaginedReplay:
     """Return a replay that knows nothing yet."""
-    spec = NetworkSpec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, outputs="joint")
+    spec = network_spec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, outputs="joint")
     options = {
         "n_rows": 32,
         "n_tried": 3,
@@ -485,7 +485,7 @@ def test_arrays_of_another_replay_are_refused_by_name(name):
 
 def make_own(grid: Grid, n_agents: int, n_landmarks: int, agent: int, **changes: object):
     """Return a replay of one agent that knows nothing yet."""
-    spec = NetworkSpec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, team="independent")
+    spec = network_spec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, team="independent")
     options = {
         "capacity": 10_000,
         "fresh": 0.7,
