@@ -29,7 +29,13 @@ from baselines.learning.exact_values import steps_left
 from baselines.learning.imitation import Imitation, ImitationOptions, good_actions_loss, start_of
 from baselines.learning.ranges import Share, Within
 from baselines.learning.train import run_training
-from baselines.networks import Network, NetworkSpec, build_network, split_joint, torch_generator
+from baselines.networks import (
+    Network,
+    build_network,
+    spec_from_options,
+    split_joint,
+    torch_generator,
+)
 from baselines.policies.acting import check_grid
 from baselines.policies.policy import load_policy
 from baselines.policies.settings import N_ACTIONS, Setting, read_setting
@@ -96,25 +102,16 @@ class Distilled(Imitation):
             raise ValueError(f"grid must have at most {MAX_CELLS:,} cells, got {grid.n_cells:,}")
         check_count("n_landmarks", args.n_landmarks, 1, grid.reachable.size)
         seeds, states = np.random.SeedSequence(args.seed).spawn(2)
-        spec = NetworkSpec(
-            kind="pairs",
-            n_agents=args.n_agents,
-            n_landmarks=args.n_landmarks,
-            n_actions=N_ACTIONS,
-            n_cells=grid.n_cells,
-            hidden_units=args.hidden_units,
-            outputs="joint",
-            code_units=args.code_units,
-            landmark_units=args.landmark_units,
-            route_units=args.route_units,
-        )
+        spec = spec_from_options(args, "pairs", grid, outputs="joint")
         network = start or build_network(spec, torch_generator(seeds))
         if network.spec != spec:
             raise ValueError(f"policy must have the network {spec}, got {network.spec}")
         super().__init__(args, network, np.random.default_rng(states))
         self.states = ImaginedReplay(
-            *(spec, grid.depot, args.batch_size, 1, 1.0, 0.0),
-            *(args.from_depot, args.max_length),
+            *(spec, grid),
+            n_rows=args.batch_size,
+            from_depot=args.from_depot,
+            max_length=args.max_length,
         )
         # Here the grid may be read, as the solver reads it, too.
         reached = np.append(grid.reachable, grid.depot)

@@ -35,8 +35,7 @@ from baselines.learning.ranges import Positive, Share, Within
 from baselines.learning.train import run_training
 from baselines.networks import Network, NetworkSpec, split_joint
 from baselines.policies.episodes import Episodes, begin, draw_problems, make_envs, rollout
-from baselines.policies.settings import Setting
-from baselines.policies.trained import load_trained
+from baselines.policies.settings import Setting, load_run
 from mapp_env.validation import check_count
 
 ALGORITHM = "self_improve"
@@ -279,7 +278,7 @@ def main(args: Args) -> int:
     start = start_of(args.resume, args.policy)
     if start is None:
         raise ValueError("policy must be the run folder of a trained meta-agent, got none")
-    policy, setting, problems = load_trained(start)
+    policy, setting, problems = load_run(start)
     if start != args.resume:  # its own copy is scaled already
         scale_outputs(policy.network, args.inverse_temperature)
     return run_training(

@@ -29,8 +29,9 @@ import numpy as np
 import torch
 
 from baselines.policies.acting import Acting, check_grid
-from baselines.policies.evaluation import Optima, evaluate, find_optima, rules_of_thumb
+from baselines.policies.evaluation import Optima, evaluate, find_optima
 from baselines.policies.policy import NetworkPolicy, load_policy, pretrained_names
+from baselines.policies.rules_of_thumb import rules_of_thumb
 from baselines.policies.settings import Setting
 from mapp_env import Problem, make_grid, replay, sample_problems, solve
 from mapp_env.solvers import optimal_costs

@@ -43,7 +43,7 @@ from baselines.learning.training import Streams, Training, training_problems
 from baselines.meta_dqn import Args as Options
 from baselines.meta_dqn import MetaLearner
 from baselines.policies.evaluation import Evaluation, evaluate, find_optima, unseen_problems
-from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
+from baselines.policies.policy import load_policy, save_policy
 from baselines.policies.settings import Setting
 from baselines.runs.folder import WEIGHTS_FILE
 from mapp_env.grids import find_grid
@@ -100,9 +100,7 @@ def search_space(states: int) -> dict[str, Any]:
 def make_options(config: dict[str, Any], states: int, seed: int) -> Options:
     """Return the preset's options with a trial's settings."""
     batch_size = states // config["updates_per_episode"]
-    return preset_options(
-        Options, "default", seed=seed, prefetch=False, batch_size=batch_size, **config
-    )
+    return preset_options(Options, "default", seed=seed, batch_size=batch_size, **config)
 
 
 def preset_point(space: dict[str, Any], states: int) -> dict[str, Any]:
@@ -153,7 +151,7 @@ def run_trial(config: dict[str, Any], states: int, n_problems: int, seed: int) -
             "CPU seconds": time.process_time(),
         }
         with tempfile.TemporaryDirectory() as folder:
-            save_policy(Path(folder) / WEIGHTS_FILE, learner.policy().network)
+            save_policy(Path(folder) / WEIGHTS_FILE, learner.policy().network, grid)
             tune.report(metrics, checkpoint=tune.Checkpoint.from_directory(folder))
 
 
@@ -225,8 +223,7 @@ def final_figures(args: Args, result: "tune.Result") -> str:
     setting = Setting(grid, options.n_agents, options.n_landmarks, options.max_cycles)
     _, final = held_out(setting, args.problems, training_problems(options, grid))
     with result.checkpoint.as_directory() as folder:
-        network = load_policy(Path(folder) / WEIGHTS_FILE).network
-    policy = NetworkPolicy(network, grid)  # a trial saves only weights, not their grid
+        policy = load_policy(Path(folder) / WEIGHTS_FILE)
     found = evaluate(policy, setting, final, find_optima(setting, final)).summary()
     return ", ".join(f"{name} {found[name]:.2f}" for name in ("solved %", "gap %", "optimal %"))
 

@@ -186,9 +186,6 @@ class Options(RunOptions):
     guidance_reach: Annotated[int, Within(1, 512)] = 3
     """how many moves away, straight and with no wall between, a landmark is still close"""
 
-    prefetch: bool = True
-    """whether the next batch is prepared in a second thread; the weights are the same"""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.updates_per_episode == self.update_interval == 0:

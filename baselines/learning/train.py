@@ -28,11 +28,11 @@ from baselines.policies.evaluation import (
     find_optima,
     format_table,
     out_of_reach,
-    rules_of_thumb,
     save_table,
     unseen_problems,
 )
 from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
+from baselines.policies.rules_of_thumb import rules_of_thumb
 from baselines.policies.settings import Setting
 from baselines.runs.checkpoints import Checkpoints, Resumable, go_on, save
 from baselines.runs.folder import (
@@ -44,6 +44,7 @@ from baselines.runs.folder import (
 )
 from baselines.runs.stop import StopSignals
 from baselines.runs.stopwatch import Stopwatch
+from mapp_env import Grid
 
 
 class Trainable(Resumable, ABC):
@@ -167,8 +168,8 @@ def run_training(
             print(f"training, {training.total:,} {training.UNIT}: {where}", flush=True)
             if not checkpoints.numbers():
                 # What it starts from, to the bit: it may have to start again.
-                save_policy(run.path(WEIGHTS_FILE), training.network)
-            train(training, run, checkpoints, signals)
+                save_policy(run.path(WEIGHTS_FILE), training.network, setting.grid)
+            train(training, setting.grid, run, checkpoints, signals)
         counts = ", ".join(f"{count:,} {name}" for name, count in training.counts().items())
         print(f"{counts} in {training.watch}")
         if signals.received is not None:
@@ -186,7 +187,7 @@ def run_training(
 
 
 def train(
-    training: Trainable, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals
+    training: Trainable, grid: Grid, run: RunFolder, checkpoints: Checkpoints, signals: StopSignals
 ) -> None:
     """Train until all is done, or a signal comes; then leave a checkpoint."""
     weights, half = run.path(WEIGHTS_FILE), training.args.half_precision
@@ -206,7 +207,7 @@ def train(
             run.log(row)
             bar.set_postfix({name: row[name] for name in training.SHOWN})
             if training.done % training.weights_interval == 0:
-                save_policy(weights, training.network, half)
+                save_policy(weights, training.network, grid, half)
             training.watch.lap("log and save")
         if time.monotonic() - saved >= training.args.checkpoint_seconds:
             save(run, checkpoints, training)
@@ -214,7 +215,7 @@ def train(
             saved = time.monotonic()
     bar.close()
     save(run, checkpoints, training)
-    save_policy(weights, training.network, half)
+    save_policy(weights, training.network, grid, half)
     training.watch.lap("log and save")
     seconds = {name: round(spent, 3) for name, spent in training.watch.seconds.items()}
     times = {"seconds": seconds, "seconds_total": round(training.watch.total, 3)}

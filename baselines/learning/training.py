@@ -13,7 +13,8 @@ from baselines.networks import Network
 from baselines.policies.acting import Acting
 from baselines.policies.evaluation import EVALUATION_SEED, Evaluation
 from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
-from baselines.policies.policy import NetworkPolicy, RandomPolicy
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.rules_of_thumb import RandomPolicy
 from baselines.policies.settings import N_ACTIONS, Setting, read_setting
 from baselines.runs.checkpoints import Saved
 from mapp_env import Grid, mapp_v0, sample_problems

@@ -11,7 +11,7 @@ import torch
 from baselines import self_improve
 from baselines.learning import train
 from baselines.learning.imitation import good_actions_loss
-from baselines.networks import NetworkSpec, build_network, split_joint, torch_generator
+from baselines.networks import build_network, network_spec, split_joint, torch_generator
 from baselines.policies.episodes import draw_problems, make_envs, rollout
 from baselines.policies.evaluation import evaluate, find_optima, unseen_problems
 from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
@@ -38,7 +38,7 @@ SMALL = {
 
 def untrained(outputs: str = "joint"):
     """Return a network that has learned nothing."""
-    spec = NetworkSpec("pairs", 2, 2, 4, 16, 32, outputs, dueling=True, code_units=16)
+    spec = network_spec("pairs", 2, 2, 4, 16, 32, outputs, dueling=True, code_units=16)
     return build_network(spec, torch_generator(np.random.SeedSequence(0)))
 
 
@@ -47,7 +47,7 @@ def folder(tmp_path):
     """Return a run folder with an untrained policy."""
     path = tmp_path / "start"
     path.mkdir()
-    save_policy(path / "policy.safetensors", untrained())
+    save_policy(path / "policy.safetensors", untrained(), GRID)
     config = {
         "options": {"n_agents": 2, "n_landmarks": 2, "max_cycles": 20},
         "grid": GRID.to_text(),
