@@ -12,9 +12,8 @@ import torch
 from baselines import meta_dqn
 from baselines.independent_dqn import Args as IndependentArgs
 from baselines.independent_dqn import IndependentLearners
-from baselines.learning import q_learning as q_learner
 from baselines.learning.config import parse_options, preset_options, without_effect
-from baselines.learning.training import Streams, Training, training_problems
+from baselines.learning.training import Streams, Training
 from baselines.meta_dqn import Args, MetaLearner
 from baselines.networks import build_network, network_spec, torch_generator
 from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
@@ -42,20 +41,6 @@ def weights(network: torch.nn.Module) -> list[torch.Tensor]:
 
 
 # -- targets -----------------------------------------------------------------------------------
-
-
-def test_targets_equal_hand_computed_ones():
-    """Termination cuts the future off, truncation and neither do not; each agent has its own."""
-    next_scores = torch.tensor(
-        [[[1.0, 4.0, 2.0, 3.0], [-1.0, -4.0, -2.0, -3.0]]] * 3, dtype=torch.float32
-    )
-    rewards = torch.tensor([-7.0, 0.0, -2.0])
-    # A time-out is stored as "not terminated", like a step in the middle of an episode.
-    terminated = torch.tensor([False, True, False])
-    best = q_learner.next_values(next_scores, next_scores, None)
-    targets = q_learner.td_targets(rewards, terminated, best, 0.95)
-    expected = [[-7 + 0.95 * 4, -7 - 0.95], [0, 0], [-2 + 0.95 * 4, -2 - 0.95]]
-    np.testing.assert_allclose(targets.numpy(), expected, atol=1e-6)
 
 
 def test_update_is_the_gradient_of_the_huber_loss_of_the_chosen_scores():
@@ -96,22 +81,6 @@ def test_update_is_the_gradient_of_the_huber_loss_of_the_chosen_scores():
             learner.network.state_dict()[name], expected, atol=1e-5, rtol=0.0
         )
     assert all(torch.equal(before[name], t) for name, t in learner.target.state_dict().items())
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_two_step_chain_learns_its_known_scores(seed):
-    """State 0 leads to state 1 for nothing, which ends with 1 for one action and 0 for others."""
-    learner = paper_learner(seed, 1, learning_rate=0.003, discount=0.9, target_interval=20)
-    states = np.array([[0, 0, 0], [8, 0, 0]], np.float32)
-    for where in range(2):
-        for action in range(4):
-            reward = float(where == 1 and action == UP)
-            learner.remember(states[where], np.array([action]), reward, states[1], where == 1)
-    for _ in range(400):
-        learner.update(0.0)
-    with torch.no_grad():
-        scores = learner.network(torch.from_numpy(states))[:, 0].numpy()
-    np.testing.assert_allclose(scores, [[0.9] * 4, [0, 0, 1, 0]], atol=0.1)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -623,25 +592,6 @@ def test_progress_rises_evenly():
     assert progress == pytest.approx([update / 30 for update in range(30)])
 
 
-def test_a_row_has_the_mean_loss_of_its_updates():
-    """With losses 1, 2, 3 ... and five updates an episode: 3, 8, 13 ..."""
-    _, rows, _ = rows_and_progress("default", updates_per_episode=5)
-    assert [row["loss"] for row in rows] == [3.0, 8.0, 13.0, 18.0, 23.0, 28.0]
-
-
-def test_no_two_draw_from_one_stream():
-    """Start weights, training problems, exploration and replay each have random numbers apart."""
-    args = Args(hidden_units=8)
-    streams = Streams.spawn(args.seed)
-    learner = MetaLearner(args, make_grid(), streams)
-    problems = training_problems(args, make_grid())
-    training = Training(args, make_grid(), problems, learner)
-    own = [np.random.default_rng(stream).random() for stream in streams]
-    assert len(set(own)) == len(streams)
-    drawn = {generator.random() for generator in (training.rng, learner.rng)}
-    assert len(drawn & set(own)) == 2
-
-
 def test_a_row_has_the_influences_of_its_episode():
     """Epsilon as at the episode's last step, guidance as in the whole of it."""
     changes = {"epsilon_start": 1.0, "epsilon_end": 0.0, "epsilon_steps": 60}
@@ -650,32 +600,6 @@ def test_a_row_has_the_influences_of_its_episode():
     last = np.cumsum([row["steps"] for row in rows]) - 1
     assert [row["epsilon"] for row in rows] == pytest.approx(1.0 - last / 60)
     assert [row["guidance"] for row in rows] == pytest.approx([0.6, 0.5, 0.4, 0.3, 0.2, 0.1])
-
-
-def test_guidance_is_that_of_the_episode():
-    """Where all obey in the first episode and nobody in the second, just that is played."""
-    args = preset_options(
-        Args,
-        "paper",
-        guidance_start=1.0,
-        guidance_end=0.0,
-        guidance_fraction=0.5,
-        n_problems=1,
-        episodes_per_problem=2,
-        max_cycles=40,
-    )
-    learner = Recorder(args, make_grid(), Streams.spawn(0))
-    training = Training(args, make_grid(), np.array([[17, 22, 25, 31, 48]]), learner)
-    obeyed = []
-    while not training.finished:
-        first, seen = not training.now.episodes, training.observation[None]
-        training.advance()
-        directions = training.guidance.directions(seen)[0]
-        taken = learner.told[-1][0]
-        obeyed += [(first, same) for same in (taken == directions)[directions >= 0].tolist()]
-    assert all(same for first, same in obeyed if first)
-    assert not all(same for first, same in obeyed if not first)
-    assert len({first for first, _ in obeyed}) == 2
 
 
 @pytest.mark.parametrize("preset", ["default", "paper"])

@@ -559,14 +559,3 @@ def test_as_much_is_kept_of_each_agent(preset, share):
     capacities = [len(learner.replay) for learner in team.learners]
     assert sum(capacities) == 150
     assert len(set(capacities)) == 1
-
-
-def test_shared_transitions_lead_to_the_same_agents_view():
-    """What an agent sees after its move is told from its own place, too."""
-    team = make("default", share_parameters=True)
-    transition = next(walk(np.random.default_rng(3), 1))
-    team.remember(*transition)
-    memory = team.learners[0].replay
-    for agent in range(3):
-        expected = view(transition[3], agent, team.spec)
-        np.testing.assert_array_equal(memory.arrays.next_observations[agent, 0], expected)
