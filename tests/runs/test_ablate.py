@@ -10,7 +10,9 @@ from baselines import ablate, meta_dqn
 from baselines.ablate import VARIANTS, Args
 from baselines.learning.config import parse_options
 from baselines.learning.training import Streams
+from baselines.replay.stored import ReplayMemory
 from mapp_env import make_grid
+from mapp_env.engine.rules import Reward
 
 WORDS = [
     *("--n-problems", "1", "--episodes-per-problem", "4", "--max-cycles", "15"),
@@ -65,21 +67,21 @@ def test_variants_are_what_they_are_called():
         learners[variant] = meta_dqn.MetaLearner(args, make_grid(), Streams.spawn(0))
     rewards = {
         variant: [
-            "step" if learner.goal(progress).reward.distances.size == 0 else "manhattan"
+            Reward(learner.goal(progress).reward.world.reward).name.lower()
             for progress in (0.0, 0.5, 1.0)
         ]
         for variant, learner in learners.items()
-        if learner.goals
+        if learner.args.replay != "stored"
     }
     assert rewards.pop("-1 a step alone") == ["step"] * 3
     assert rewards.pop("paper's reward alone") == ["manhattan"] * 3
     assert set(map(tuple, rewards.values())) == {("manhattan", "step", "step")}
     assert learners["plain numbers"].spec.kind == "paper"
     assert learners["12 outputs"].spec.values_shape == (3, 4)
-    assert learners["replay as played"].imagined is None
-    assert learners["one action a state"].imagined.n_tried == 1
+    assert isinstance(learners["replay as played"].replay, ReplayMemory)
+    assert learners["one action a state"].replay.n_tried == 1
     assert learners["no wider action gap"].args.action_gap == 0
-    assert learners["no retries"].imagined.retries == 0
+    assert learners["no retries"].replay.retries == 0
     assert learners["double DQN"].args.double
     assert not learners["no dueling"].spec.dueling
     assert not learners["constant step size"].args.learning_rate_falls
