@@ -62,6 +62,7 @@ from baselines.learning.q_learning import (
     next_values,
     td_targets,
 )
+from baselines.learning.ranges import Share
 from baselines.learning.training import Streams, train_learner
 from baselines.networks import (
     NetworkSpec,
@@ -77,7 +78,6 @@ from baselines.replay.relabelled import RelabelledReplay
 from baselines.replay.stored import Batch, ReplayMemory
 from baselines.runs.checkpoints import part
 from mapp_env import Grid
-from mapp_env.validation import check_flag, check_number
 
 ALGORITHM = "independent_dqn"
 
@@ -89,7 +89,7 @@ class Args(Options):
     network: Literal["pairs", "paper", "geodesic"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
     landmarks as a set, agents in a fixed order; "geodesic": the agent's own shortest paths, the
-    observation of that name, landmarks as a set (baselines/networks/__init__.py)"""
+    observation of that name, landmarks as a set (baselines/networks/geodesic.py)"""
     outputs: Literal["agents"] = "agents"
     """a value for each action of the agent itself"""
     replay: Literal["relabelled", "imagined", "stored"] = "relabelled"
@@ -99,18 +99,15 @@ class Args(Options):
 
     share_parameters: bool = False
     """whether all agents use one network, which learns from all of them"""
-    fresh_landmarks: float = 0.9
+    fresh_landmarks: Share = 0.9
     """share of the relabelled transitions that get fresh landmarks; the others keep their own"""
-    fresh_as_far: float = 0.9
+    fresh_as_far: Share = 0.9
     """share of those with as many landmarks visited as were; the others with any number"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_flag("share_parameters", self.share_parameters)
         if self.share_parameters and self.replay == "imagined":
             raise ValueError("share_parameters must be False with replay 'imagined', got True")
-        check_number("fresh_landmarks", self.fresh_landmarks, 0.0, 1.0)
-        check_number("fresh_as_far", self.fresh_as_far, 0.0, 1.0)
 
 
 def make_replay(
