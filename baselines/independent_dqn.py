@@ -89,7 +89,7 @@ class Args(Options):
     network: Literal["pairs", "paper", "geodesic"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
     landmarks as a set, agents in a fixed order; "geodesic": the agent's own shortest paths, the
-    observation of that name, landmarks as a set (baselines/networks/__init__.py)"""
+    observation of that name, landmarks as a set (baselines/networks/geodesic.py)"""
     outputs: Literal["agents"] = "agents"
     """a value for each action of the agent itself"""
     replay: Literal["relabelled", "imagined", "stored"] = "relabelled"

@@ -52,6 +52,7 @@ class Options(RunOptions):
     PRESETS: ClassVar[dict[str, dict[str, Any]]] = {
         "default": {},
         "paper": {
+            "preset": "paper",
             "network": "paper",
             "outputs": "agents",
             "dueling": False,
@@ -96,7 +97,7 @@ class Options(RunOptions):
 
     network: Literal["pairs", "paper"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
-    landmarks as a set, agents exchangeable (baselines/networks/__init__.py)"""
+    landmarks as a set, agents exchangeable (baselines/networks/pairs.py)"""
     outputs: Literal["joint", "agents"] = "joint"
     """a value for each joint action (64), or for each action of each agent (12, the paper's)"""
     dueling: bool = True
@@ -247,8 +248,7 @@ Chosen = TypeVar("Chosen", bound=RunOptions)
 def preset_options(kind: type[Chosen], preset: str, **changes: Any) -> Chosen:
     """Return a preset's options, with changes."""
     check_choice("preset", preset, tuple(kind.PRESETS))
-    named = {"preset": preset} if len(kind.PRESETS) > 1 else {}
-    return kind(**{**named, **kind.PRESETS[preset], **changes})
+    return kind(**{**kind.PRESETS[preset], **changes})
 
 
 # -- the command line --------------------------------------------------------------------------

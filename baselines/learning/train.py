@@ -10,8 +10,9 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from datetime import datetime
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -35,13 +36,7 @@ from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
 from baselines.policies.rules_of_thumb import rules_of_thumb
 from baselines.policies.settings import Setting
 from baselines.runs.checkpoints import Checkpoints, Resumable, go_on, save
-from baselines.runs.folder import (
-    METRICS_FILE,
-    TIMING_FILE,
-    WEIGHTS_FILE,
-    RunFolder,
-    default_folder,
-)
+from baselines.runs.folder import METRICS_FILE, TIMING_FILE, WEIGHTS_FILE, RunFolder
 from baselines.runs.stop import StopSignals
 from baselines.runs.stopwatch import Stopwatch
 from mapp_env import Grid
@@ -139,25 +134,23 @@ def run_training(
     unseen = unseen_problems(setting, n_evaluated, problems) if n_evaluated else None
     training = make_training()
     preset = getattr(args, "preset", "default")
-    folder = args.resume or args.out or default_folder(algorithm, preset, args.seed)
-    task = {name: getattr(setting, name) for name in TASK}
+    name = f"{algorithm}-{preset}-seed{args.seed}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = args.resume or args.out or Path("runs") / name
     # The folder's name is none of what a run is: it may be moved.
-    options = {**asdict(args), **task, "out": None, "resume": None}
+    task = {name: getattr(setting, name) for name in TASK}
     config = {
         "algorithm": algorithm,
-        "options": options,
+        "options": {**asdict(args), **task, "out": None, "resume": None},
         "grid": setting.grid.to_text(),
         "training_problems": problems,
     }
-    run = RunFolder(folder, training.COLUMNS, resume=args.resume is not None)
-    signals = StopSignals()
+    run, signals = (
+        RunFolder(folder, training.COLUMNS, resume=args.resume is not None),
+        StopSignals(),
+    )
     try:
-        checkpoints = Checkpoints(folder, config)
         with signals:
-            if args.resume is None:
-                run.write_config({**config, "options": {**options, "out": str(folder)}})
-            elif go_on(run, checkpoints, training):
-                print(f"going on from {training.UNIT.removesuffix('s')} {training.done + 1:,}")
+            checkpoints = begin(training, setting.grid, run, config)
             if n_evaluated < args.evaluation_problems:
                 print(
                     f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there "
@@ -166,9 +159,6 @@ def run_training(
             # Without a terminal there is no bar: say where to look.
             where = run.path(METRICS_FILE)
             print(f"training, {training.total:,} {training.UNIT}: {where}", flush=True)
-            if not checkpoints.numbers():
-                # What it starts from, to the bit: it may have to start again.
-                save_policy(run.path(WEIGHTS_FILE), training.network, setting.grid)
             train(training, setting.grid, run, checkpoints, signals)
         counts = ", ".join(f"{count:,} {name}" for name, count in training.counts().items())
         print(f"{counts} in {training.watch}")
@@ -184,6 +174,19 @@ def run_training(
         run.close()
     print(f"\nrun folder: {folder}")
     return 0
+
+
+def begin(training: Trainable, grid: Grid, run: RunFolder, config: dict[str, Any]) -> Checkpoints:
+    """Write what a new run is and what it starts from, or take up a resumed one."""
+    checkpoints = Checkpoints(run.folder, config)
+    if training.args.resume is None:
+        run.write_config({**config, "options": {**config["options"], "out": str(run.folder)}})
+    elif go_on(run, checkpoints, training):
+        print(f"going on from {training.UNIT.removesuffix('s')} {training.done + 1:,}")
+    if not checkpoints.numbers():
+        # To the bit: it may have to start again.
+        save_policy(run.path(WEIGHTS_FILE), training.network, grid)
+    return checkpoints
 
 
 def train(

@@ -20,7 +20,6 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -203,11 +202,6 @@ def foreign_entry(folder: Path) -> str | None:
             continue
         return path.name
     return None
-
-
-def default_folder(algorithm: str, preset: str, seed: int) -> Path:
-    """Name a run folder after what is run and the time."""
-    return Path("runs") / f"{algorithm}-{preset}-seed{seed}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 def read_config(folder: Path) -> dict[str, Any]:

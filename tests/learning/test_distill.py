@@ -300,7 +300,7 @@ def test_a_run_starts_with_its_policys_own_weights(tmp_path, monkeypatch, half_p
     """What it may have to start from again is kept to the bit, however the end is kept."""
     kept = []
 
-    def noted(training, run, *others):
+    def noted(training, grid, run, *others):
         start = load_policy(run.folder).network.state_dict()
         kept.append([torch.equal(start[k], v) for k, v in training.network.state_dict().items()])
         raise ZeroDivisionError

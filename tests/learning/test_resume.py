@@ -457,7 +457,7 @@ def test_resume_takes_no_other_options(tmp_path):
         run(Args(resume=tmp_path, seed=3))
     with pytest.raises(ValueError, match="leave out out"):
         run(Args(resume=tmp_path, out=tmp_path / "x"))
-    with pytest.raises(ValueError, match=r"config\.json: "):
+    with pytest.raises(ValueError, match=r"config\.json': cannot be opened"):
         run(Args(resume=tmp_path))
 
 
