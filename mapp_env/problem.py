@@ -273,7 +273,7 @@ def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[
         limit = (LOW_32_BITS + 1) // span * span
         bits = limit
         while bits >= limit:
-            bits = _scramble(_scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
+            bits = scramble(scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
             used += 1
         pick = bits % span
         for earlier in range(chosen):
@@ -289,13 +289,19 @@ def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[
         out[index] = candidates[out[index]]
 
 
-@kernel
-def _scramble(state: int) -> int:
-    """Return a 32-bit permutation of ``state`` (PCG RXS-M-XS; O'Neill 2014, HMC-CS-2014-0905).
+# A 32-bit PCG RXS-M-XS (O'Neill 2014, HMC-CS-2014-0905) in 64-bit signed arithmetic that never
+# overflows, so that it means the same with and without compilation.
 
-    Written in 64-bit signed arithmetic that never overflows, so that it means the same with and
-    without compilation.
-    """
-    state = (state * 747796405 + 2891336453) & LOW_32_BITS
+
+@kernel
+def next_word(word: int) -> int:
+    """Return the generator's state after ``word``."""
+    return (word * 747796405 + 2891336453) & LOW_32_BITS
+
+
+@kernel
+def scramble(word: int) -> int:
+    """Return a permutation of 32 bits: the generator's output after ``word``."""
+    state: int = next_word(word)
     state = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & LOW_32_BITS
     return (state >> 22) ^ state
