@@ -15,18 +15,16 @@ ablation.md and ablation.csv: interquartile means over the seeds with 95 % boots
 Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings, each with a checkpoint.
 """
 
-import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from baselines import meta_dqn
-from baselines.learning.study import run_study
-from baselines.learning.trials import Trial, plan_trial
-from mapp_env.validation import check_choice, check_count
+from baselines.learning.study import Groups, StudyArgs, check_distinct, run_study
+from mapp_env.validation import check_choice
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -46,41 +44,23 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass
-class Args:
+class Args(StudyArgs):
     """Options of an ablation; all others are handed to the trainings."""
 
     out: Path = Path("runs/ablation")
     """folder of the runs and the tables"""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """what to train"""
-    seeds: int = 5
-    """trainings of each: seeds 0, 1, 2 ..."""
-    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """trainings at a time"""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        check_distinct("variants", self.variants)
         for variant in self.variants:
             check_choice("variants", variant, tuple(VARIANTS))
-        if not self.variants or len(set(self.variants)) < len(self.variants):
-            raise ValueError(f"variants must be one or more, none twice, got {self.variants!r}")
-        check_count("seeds", self.seeds, 1, 10_000)
-        check_count("jobs", self.jobs, 1, 1024)
 
-
-def plan_trials(args: Args, words: Sequence[str]) -> list[Trial]:
-    """Return all trainings, those of one seed together.
-
-    Raises
-    ------
-    ValueError
-        If an option is refused, or a folder holds a training with other options.
-    """
-    kind = (meta_dqn.ALGORITHM, meta_dqn.Args)
-    return [
-        plan_trial((variant,), seed, args.out, kind, VARIANTS[variant], words)
-        for seed in range(args.seeds)
-        for variant in args.variants
-    ]
+    def groups(self) -> Groups:
+        """Return the variants."""
+        return {(variant,): (meta_dqn, VARIANTS[variant]) for variant in self.variants}
 
 
 def main(args: Args, words: Sequence[str] = ()) -> int:
@@ -91,8 +71,7 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
     ValueError
         If an option is refused, or a training has failed.
     """
-    trials = plan_trials(args, words)
-    return run_study(trials, args.out / "ablation", ("variant",), args.jobs)[0]
+    return run_study(args, words, "ablation", ("variant",))[0]
 
 
 if __name__ == "__main__":

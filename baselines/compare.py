@@ -17,32 +17,31 @@ unsolved problem counted with the step limit) and of the return of the last trai
 Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings, each with a checkpoint.
 """
 
-import os
+import itertools
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Literal
 
 import tyro
 
 from baselines import independent_dqn, meta_dqn
-from baselines.learning.config import Options
-from baselines.learning.study import Summary, interval, run_study
-from baselines.learning.trials import Trial, plan_trial
+from baselines.learning.study import Groups, StudyArgs, Train, check_distinct, run_study
+from baselines.learning.summary import Summary, interval
 from mapp_env.validation import check_count
 
-LEARNERS: dict[str, tuple[str, type[Options], tuple[str, ...]]] = {
-    "meta": (meta_dqn.ALGORITHM, meta_dqn.Args, ()),
-    "independent": (independent_dqn.ALGORITHM, independent_dqn.Args, ()),
-    "shared": (independent_dqn.ALGORITHM, independent_dqn.Args, ("--share-parameters",)),
+LEARNERS: dict[str, tuple[ModuleType, tuple[str, ...]]] = {
+    "meta": (meta_dqn, ()),
+    "independent": (independent_dqn, ()),
+    "shared": (independent_dqn, ("--share-parameters",)),
 }
 COLUMNS = ("preset", "learner")
-TABLE = "comparison"
 
 
 @dataclass
-class Args:
+class Args(StudyArgs):
     """Options of a comparison; all others are handed to the trainings."""
 
     out: Path = Path("runs/compare")
@@ -58,48 +57,30 @@ class Args:
     by themselves"""
     default_updates: int | None = None
     """updates after each episode under the preset default (32, its own)"""
-    seeds: int = 5
-    """trainings of each: seeds 0, 1, 2 ..."""
-    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """trainings at a time"""
 
     def __post_init__(self) -> None:
-        for name in ("presets", "learners"):
-            values = getattr(self, name)
-            if not values or len(set(values)) < len(values):
-                raise ValueError(f"{name} must be one or more, none twice, got {values!r}")
+        super().__post_init__()
+        check_distinct("presets", self.presets)
+        check_distinct("learners", self.learners)
         if self.default_updates is not None:
             check_count("default_updates", self.default_updates, 1, 1_000_000)
             if "default" not in self.presets:
                 raise ValueError(
                     f"default_updates has no effect with presets {self.presets!r}: leave it out"
                 )
-        check_count("seeds", self.seeds, 1, 10_000)
-        check_count("jobs", self.jobs, 1, 1024)
+
+    def groups(self) -> Groups:
+        """Return each learner under each preset."""
+        found: Groups = {}
+        for preset, learner in itertools.product(self.presets, self.learners):
+            script, own = LEARNERS[learner]
+            updates = ("--updates-per-episode", str(self.default_updates or 32))
+            own = ("--preset", preset, *own, *(updates if preset == "default" else ()))
+            found[preset, learner] = script, own
+        return found
 
 
-def plan_trials(args: Args, words: Sequence[str]) -> list[Trial]:
-    """Return all trainings, those of one seed together.
-
-    Raises
-    ------
-    ValueError
-        If a learner does not take an option, or a folder holds a training with other options.
-    """
-    trials = []
-    for seed in range(args.seeds):
-        for preset in args.presets:
-            for learner in args.learners:
-                algorithm, kind, own = LEARNERS[learner]
-                own = ("--preset", preset, *own)
-                if preset == "default":
-                    own += ("--updates-per-episode", str(args.default_updates or 32))
-                group = (preset, learner)
-                trials.append(plan_trial(group, seed, args.out, (algorithm, kind), own, words))
-    return trials
-
-
-def main(args: Args, words: Sequence[str] = ()) -> int:
+def main(args: Args, words: Sequence[str] = (), train: Train | None = None) -> int:
     """Train, compare, draw; return the exit code.
 
     Raises
@@ -107,8 +88,7 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
     ValueError
         If an option is refused, or a training has failed.
     """
-    trials = plan_trials(args, words)
-    code, summaries = run_study(trials, args.out / TABLE, COLUMNS, args.jobs)
+    code, summaries = run_study(args, words, "comparison", COLUMNS, train)
     if code == 0:
         draw(args.out, summaries)
     return code

@@ -29,7 +29,6 @@ from baselines.policies.acting import Acting
 from baselines.policies.evaluation import (
     EVALUATION_SEED,
     MAX_EXACT_LANDMARKS,
-    RULES,
     Evaluation,
     count_problems,
     count_unseen,
@@ -38,14 +37,12 @@ from baselines.policies.evaluation import (
     find_optima,
     format_table,
     out_of_reach,
-    rules_of_thumb,
     save_table,
     unseen_problems,
 )
 from baselines.policies.guidance import Guidance, GuidedPolicy
-from baselines.policies.policy import RandomPolicy
-from baselines.policies.settings import N_ACTIONS, Setting
-from baselines.policies.trained import load_trained
+from baselines.policies.rules_of_thumb import RULES, RandomPolicy, rules_of_thumb
+from baselines.policies.settings import N_ACTIONS, Setting, load_run
 from mapp_env.grids import find_grid
 from mapp_env.validation import check_count, check_number
 
@@ -83,6 +80,8 @@ class Args:
     """folder for evaluation.csv and evaluation.md; nothing is written without it"""
     threads: int = 1
     """threads of PyTorch"""
+    device: str = "cpu"
+    """where the policy's network computes, as PyTorch names it"""
 
     def __post_init__(self) -> None:
         if self.problems != "universe":
@@ -123,7 +122,7 @@ def main(args: Args) -> None:
             label, rule = RULES[args.policy]
             policy = rule(setting.grid, setting.n_agents, setting.n_landmarks)
     else:
-        policy, setting, seen = load_trained(args.policy)
+        policy, setting, seen = load_run(args.policy, args.device)
     if args.guidance > 0:
         reach = 3 if args.guidance_reach is None else args.guidance_reach
         guidance = Guidance(setting.grid, setting.n_agents, setting.n_landmarks, reach)

@@ -28,8 +28,7 @@ import tyro
 from baselines.networks import NetworkSpec
 from baselines.policies.evaluation import evaluate, every_problem
 from baselines.policies.policy import find_weights, load_policy
-from baselines.policies.settings import Setting
-from baselines.policies.trained import load_trained
+from baselines.policies.settings import Setting, load_run
 from mapp_env import Grid, make_grid
 from mapp_env.files import write_bytes
 
@@ -63,7 +62,7 @@ def export(policy: str) -> str:
         If there is no such policy, or the page cannot run it: it is of another setting or kind,
         or has weights that 16 bits have no room for.
     """
-    trained, setting, _ = load_trained(policy)
+    trained, setting, _ = load_run(policy)
     check_setting(policy, setting)
     check_network(policy, trained.spec)
     file = find_weights(policy)
@@ -165,7 +164,7 @@ def kept_rows(spec: NetworkSpec, grid: Grid) -> dict[str, np.ndarray]:
 
 def count_changed(policy: str) -> tuple[int, int, int]:
     """Return how many problems there are, and on how many rounding changes actions, or steps."""
-    exact, setting, _ = load_trained(policy)
+    exact, setting, _ = load_run(policy)
     rounded = load_policy(policy)
     with torch.no_grad():
         for tensor in rounded.network.parameters():

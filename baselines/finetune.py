@@ -32,8 +32,9 @@ from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
-from baselines.meta_dqn import joint_values
+from baselines.learning.q_learning import joint_values
 from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
+from baselines.policies import play
 from baselines.policies.acting import check_grid
 from baselines.policies.evaluation import (
     MAX_EXACT_LANDMARKS,
@@ -43,10 +44,11 @@ from baselines.policies.evaluation import (
     unseen_problems,
 )
 from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import N_ACTIONS, Setting
-from baselines.policies.trained import load_trained
-from baselines.replay.imagined import UNKNOWN, is_on, join
+from baselines.policies.settings import N_ACTIONS, Setting, load_run
+from baselines.replay.imagined import UNKNOWN, join
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.task import make_world
 from mapp_env.validation import check_count, check_number
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
@@ -160,6 +162,7 @@ class Tuner:
         cells = np.full((n_rows, self.spec.n_agents), problem.grid.depot)
         landmarks = np.tile(np.array(problem.landmarks), (n_rows, 1))
         visited = np.zeros(landmarks.shape, np.bool_)
+        world = make_world(problem.grid, self.spec.n_agents, self.spec.n_landmarks)
         seen, taken = [], []
         limit = problem.max_cycles if self.best is None else len(self.best.joint)
         for _ in range(limit or 0):
@@ -176,7 +179,7 @@ class Tuner:
             taken.append(joint)
             moved = self.moves[cells, self.digits[joint]]
             cells = np.where(going_on[:, None], moved, cells)
-            visited = visited | (is_on(cells, landmarks) & going_on[:, None])
+            visited[going_on] = visit_rows(world, cells, landmarks, visited)[0][going_on]
             done = visited.all(axis=1)
             if done.any():
                 row = int(done.argmax())
@@ -207,7 +210,7 @@ def finetune(
         random = 0 < episode <= args.random_episodes  # the first shows what the policy can do
         if episode > args.random_episodes:
             tuner.train()
-        plan = play(env, tuner, random)
+        plan = run_episode(env, tuner, random)
         waited += episode > args.random_episodes
         if best is None or (plan.success, -plan.cover_time) > (best.success, -best.cover_time):
             best, waited = plan, 0
@@ -217,7 +220,7 @@ def finetune(
     return best, args.episodes
 
 
-def play(env: mapp_v0.parallel_env, tuner: Tuner, random: bool) -> Plan:
+def run_episode(env: mapp_v0.parallel_env, tuner: Tuner, random: bool) -> Plan:
     """Play an episode, greedily or at random, and remember where the moves led."""
     leader = env.possible_agents[0]
     policy = NetworkPolicy(tuner.network)
@@ -260,7 +263,7 @@ def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[
     seconds, gaps = [], []
     for row in tqdm(rows, disable=None):
         start = time.perf_counter()
-        problem = solving.make_problem(setting, tuple(landmarks[row].tolist()))
+        problem = setting.problem(tuple(landmarks[row].tolist()))
         plan, _ = finetune(args, policy, setting, problem)
         seconds.append(time.perf_counter() - start)
         gaps.append(plan.cover_time / optima.cover_time[row] - 1.0)
@@ -277,12 +280,12 @@ def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[
 def main(args: Args) -> int:
     """Fine-tune on one problem; return the exit code."""
     torch.set_num_threads(1)
-    policy, setting, seen = load_trained(args.policy)
+    policy, setting, seen = load_run(args.policy)
     if args.problems:
         study(args, policy, setting, seen)
         return 0
-    problem = solving.make_problem(setting, args.landmarks)
-    before = solving.solve_by_policy(policy, setting, problem)
+    problem = setting.problem(args.landmarks)
+    before = play(policy, [problem])[0]
     start = time.perf_counter()
     after, n_episodes = finetune(args, policy, setting, problem)
     seconds = time.perf_counter() - start

@@ -19,7 +19,7 @@ Two options are for controlled comparisons: ``--network geodesic`` gives every a
 shortest paths to look at (the observation of that name) in place of the 13 numbers; ``--replay
 imagined`` recombines moves as the meta-agent's replay does, but only the agent's own. What the
 others do in imagined states is what the agent saw them do: they go through the cells that they went
-through in the episodes played, whatever the landmarks are now (``own_imagined_replay.py``).
+through in the episodes played, whatever the landmarks are now (``replay/own_imagined.py``).
 
 Fairness: the same episodes, and for every network as many updates, of as many states, as the
 meta-agent's one network gets. In the default preset three learners take about twice the
@@ -27,6 +27,10 @@ meta-agent's time, and learners that share their parameters about four fifths of
 
 Paper: M. Cetinkaya, Multi-Agent Path Planning Using Deep Reinforcement Learning, section 5
 (arXiv 2110.01460), which leaves open how independent learners would do.
+
+The algorithm stands in :class:`AgentLearner`, step by step as the meta-agent's in ``meta_dqn.py``.
+What differs is what an agent is told, ``remember`` of :class:`IndependentLearners`, and what it
+can learn from that, the replay in ``sample``.
 
 Command::
 
@@ -40,27 +44,34 @@ Output: a run folder as of meta_dqn.py; policy.safetensors holds the networks of
 
 import sys
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
 
 from baselines.learning.config import Options, parse_options
-from baselines.learning.experiment import run_experiment
-from baselines.learning.q_learning import Goal, QLearner, next_values, td_targets
-from baselines.learning.training import Streams
+from baselines.learning.q_learning import (
+    QLearner,
+    action_values,
+    chosen_values,
+    imagination,
+    learning_rate,
+    move_target,
+    next_values,
+    td_targets,
+)
+from baselines.learning.training import Streams, train_learner
 from baselines.networks import (
-    Network,
     NetworkSpec,
-    Team,
     build_network,
     greedy_actions,
+    spec_from_options,
     torch_generator,
     view,
 )
 from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import N_ACTIONS
 from baselines.replay.own_imagined import OwnImaginedReplay
 from baselines.replay.relabelled import RelabelledReplay
 from baselines.replay.stored import Batch, ReplayMemory
@@ -71,16 +82,9 @@ from mapp_env.validation import check_flag, check_number
 ALGORITHM = "independent_dqn"
 
 
-# -- configuration -----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Args(Options):
     """Options of independent learners; those of joint values have no effect."""
-
-    OUTPUTS: ClassVar[tuple[str, ...]] = ("agents",)
-    REPLAYS: ClassVar[tuple[str, ...]] = ("relabelled", "imagined", "stored")
-    NETWORKS: ClassVar[tuple[str, ...]] = ("pairs", "paper", "geodesic")
 
     network: Literal["pairs", "paper", "geodesic"] = "pairs"
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
@@ -109,231 +113,105 @@ class Args(Options):
         check_number("fresh_as_far", self.fresh_as_far, 0.0, 1.0)
 
 
-# -- network -----------------------------------------------------------------------------------
-
-
-def make_network(args: Args, grid: Grid, generator: torch.Generator) -> Team:
-    """Build the networks of all agents."""
-    spec = NetworkSpec(
-        kind=args.network,
-        n_agents=args.n_agents,
-        n_landmarks=args.n_landmarks,
-        n_actions=N_ACTIONS,
-        n_cells=grid.n_cells,
-        hidden_units=args.hidden_units,
-        outputs=args.outputs,
-        dueling=args.dueling,
-        code_units=args.code_units,
-        landmark_units=args.landmark_units,
-        route_units=args.route_units,
-        team="shared" if args.share_parameters else "independent",
-        grid=grid.to_text() if args.network == "geodesic" else "",
-    )
-    team = build_network(spec, generator)
-    assert isinstance(team, Team)
-    return team
-
-
-# -- loss --------------------------------------------------------------------------------------
-
-
-def chosen_values(values: Tensor, actions: Tensor) -> Tensor:
-    """Return the values (B, T) of the agent's own actions taken.
-
-    Parameters
-    ----------
-    values
-        (B, 1, A).
-    actions
-        (B, T, 1).
-    """
-    return values[:, 0].gather(1, actions[:, :, 0])
-
-
-# -- learner -----------------------------------------------------------------------------------
+def make_replay(
+    args: Args, grid: Grid, spec: NetworkSpec, agent: int, n_sources: int
+) -> ReplayMemory | OwnImaginedReplay:
+    """Build the memory of what an agent did, or of what several did that share a network."""
+    # Of each agent, as many transitions as are kept of it when it learns alone.
+    capacity = n_sources * args.memory_size
+    if args.replay == "stored":
+        return ReplayMemory(capacity, spec.n_inputs, 1, args.reward_scale)
+    fresh = args.fresh_landmarks
+    if args.replay == "relabelled":
+        return RelabelledReplay(spec, grid.depot, capacity, fresh, args.fresh_as_far)
+    options = imagination(args)
+    return OwnImaginedReplay(spec, grid, agent, capacity=capacity, fresh=fresh, **options)
 
 
 class AgentLearner(QLearner):
-    """One network, its target network, optimiser and replay.
+    """One agent's network, or one that all share, and what it learns with."""
 
-    Parameters
-    ----------
-    args
-        Options.
-    grid
-        The grid.
-    network, target
-        One agent's networks.
-    agent
-        Which agent it is, if it is one agent's.
-    n_sources
-        Agents whose transitions it learns from: itself, or all that share the network.
-    seeds
-        Of its own random numbers.
-    """
-
-    def __init__(
-        self,
-        args: Args,
-        grid: Grid,
-        network: Network,
-        target: Network,
-        agent: int,
-        n_sources: int,
-        seeds: np.random.SeedSequence,
-    ) -> None:
-        super().__init__(args, grid, network, target, np.random.default_rng(seeds))
-        self.memory: ReplayMemory | None = None
-        self.relabelled: RelabelledReplay | None = None
-        self.imagined: OwnImaginedReplay | None = None
-        # Of each agent, as many transitions as are kept of it when it learns alone.
-        capacity = n_sources * args.memory_size
-        if args.replay == "stored":
-            self.memory = ReplayMemory(capacity, self.spec.n_inputs, 1)
-        elif args.replay == "imagined":
-            self.imagined = OwnImaginedReplay(
-                self.spec,
-                agent,
-                grid.depot,
-                capacity,
-                args.fresh_landmarks,
-                args.batch_size,
-                args.tried_actions,
-                args.temperature,
-                args.imagined_exploration,
-                args.imagined_from_depot,
-                args.imagined_length,
-                args.imagined_retries,
-            )
+    @torch.no_grad()
+    def sample(self, progress: float) -> tuple[Batch, Tensor]:
+        """Draw a batch, and compute the targets of its values."""
+        args, goal, replay = self.args, self.goal(progress), self.replay
+        # The states: imagined along the policy, relabelled, or stored.
+        here = None
+        if isinstance(replay, OwnImaginedReplay):
+            replay.start_over(self.rng)
+            here = self.target(torch.from_numpy(replay.observations()))
+            batch, _ = replay.draw(here[:, 0].cpu().numpy(), goal.reward, self.rng)
+        elif isinstance(replay, RelabelledReplay):
+            batch = replay.relabel(args.batch_size, goal.reward, self.rng)
+            here = self.target(torch.from_numpy(batch.observations))
         else:
-            self.relabelled = RelabelledReplay(
-                self.spec, grid.depot, capacity, args.fresh_landmarks, args.fresh_as_far
-            )
+            batch = replay.sample(args.batch_size, self.rng)
 
-    # -- learning
+        # The targets: the reward, and the best that can follow.
+        next_obs = torch.from_numpy(batch.next_observations)
+        values = action_values(self.target, next_obs)
+        chooser = action_values(self.network, next_obs) if args.double else values
+        best = next_values(values, chooser, replay.known_actions(batch.next_observations))
+        if here is not None:
+            # No reward of the rules is above 0, so no value is. Without this bound the values of
+            # a learner can feed on themselves and grow past all measure: where it has not been
+            # with the others, nothing it experienced contradicts them.
+            best = best.clamp(max=0.0)
+        rewards, terminated = map(torch.from_numpy, (batch.rewards, batch.terminated))
+        targets = td_targets(rewards, terminated, best, goal.discount)
 
-    def remember(
-        self,
-        observation: np.ndarray,
-        action: int,
-        reward: float,
-        next_observation: np.ndarray,
-        terminated: bool,
-    ) -> None:
-        """Take note of an agent's transition: its own action, nobody else's."""
-        if self.memory is not None:
-            self.memory.add(observation, np.array([action]), reward, next_observation, terminated)
-        if self.relabelled is not None:
-            self.relabelled.remember(observation, action, next_observation)
-        if self.imagined is not None:
-            self.imagined.remember(observation, np.array([action]), next_observation)
+        if args.action_gap and here is not None:
+            best = next_values(here, here, replay.known_actions(batch.observations))[:, None]
+            taken = chosen_values(here, torch.from_numpy(batch.actions), self.spec)
+            targets -= args.action_gap * (best - taken)
+        return batch, targets
 
-    @property
-    def ready(self) -> bool:
-        """Whether there is something to learn from."""
-        replay = self.replay
-        return True if isinstance(replay, ReplayMemory) else replay.ready
+    def update(self, progress: float) -> float:
+        """One step of Adam down the Huber loss of a batch; return the loss.
 
-    @property
-    def replay(self) -> ReplayMemory | RelabelledReplay | OwnImaginedReplay:
-        """What is learned from."""
-        if self.memory is not None:
-            return self.memory
-        if self.imagined is not None:
-            return self.imagined
-        assert self.relabelled is not None
-        return self.relabelled
-
-    def prepare(self, progress: float) -> tuple[Batch, Tensor]:
-        """Return a batch and the targets of its values."""
-        if self.imagined is not None:
-            return self.prepare_imagined(self.imagined, self.goal(progress))
+        Parameters
+        ----------
+        progress
+            Part of the training that is over, 0 to 1.
+        """
         args = self.args
-        with torch.no_grad():
-            if self.memory is not None:
-                batch = self.memory.sample(args.batch_size, self.rng)
-                scale, discount = args.reward_scale, args.discount
-            else:
-                assert self.relabelled is not None
-                goal = self.goal(progress)
-                batch = self.relabelled.draw(args.batch_size, goal.reward, self.rng)
-                scale, discount = 1.0, goal.discount  # already in the reward
-            seen = torch.from_numpy(batch.next_observations[:, 0])
-            values = self.target(seen)[:, 0]
-            chooser = self.network(seen)[:, 0] if args.double else values
-            following = next_values(values, chooser, None)
-            if self.relabelled is not None:
-                # No reward of the rules is above 0, so no value is. Without this bound the values
-                # of a learner can feed on themselves and grow past all measure: where it has not
-                # been with the others, nothing it experienced contradicts them.
-                following = following.clamp(max=0.0)
-            targets = td_targets(
-                scale * torch.from_numpy(batch.rewards[:, 0]),
-                torch.from_numpy(batch.terminated[:, 0]),
-                following,
-                discount,
-            ).view(*batch.rewards.shape)
-            if args.action_gap and self.relabelled is not None:
-                here = self.target(torch.from_numpy(batch.observations))
-                taken = chosen_values(here, torch.from_numpy(batch.actions))
-                targets -= args.action_gap * (here[:, 0].amax(1, keepdim=True) - taken)
-        return batch, targets
+        batch, targets = self.prepared or self.sample(progress)
+        self.prepared = self.sample(progress) if self.ahead else None
 
-    def prepare_imagined(self, imagined: OwnImaginedReplay, goal: Goal) -> tuple[Batch, Tensor]:
-        """Return imagined transitions, and the targets of their values."""
-        with torch.no_grad():
-            imagined.start_over(self.rng)
-            here = self.target(torch.from_numpy(imagined.observations()))
-            batch = imagined.draw(here[:, 0].numpy(), goal.reward, self.rng)
-            flat = batch.next_observations.reshape(-1, self.spec.n_inputs)
-            seen = torch.from_numpy(flat)
-            values = self.target(seen)
-            chooser = self.network(seen) if self.args.double else values
-            following = next_values(values, chooser, imagined.known_actions(flat))[:, 0]
-            targets = td_targets(
-                torch.from_numpy(batch.rewards.reshape(-1)),
-                torch.from_numpy(batch.terminated.reshape(-1)),
-                following.clamp(max=0.0),  # as above
-                goal.discount,
-            ).view(*batch.rewards.shape)
-            if self.args.action_gap:
-                best = next_values(here, here, imagined.known_actions(batch.observations))
-                taken = chosen_values(here, torch.from_numpy(batch.actions))
-                targets -= self.args.action_gap * (best - taken)
-        return batch, targets
+        obs, actions = map(torch.from_numpy, (batch.observations, batch.actions))
+        loss = smooth_l1_loss(
+            chosen_values(self.network(obs), actions, self.spec), targets, beta=args.huber_delta
+        )
+        self.optimiser.param_groups[0]["lr"] = learning_rate(args, progress, self.updates)
+        self.optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
 
-    def chosen(self, values: Tensor, actions: Tensor) -> Tensor:
-        """Return the values of the agent's own actions taken."""
-        return chosen_values(values, actions)
+        self.updates += 1
+        move_target(self.target, self.network, args, self.updates)
+        return loss.item()
 
 
 class IndependentLearners:
     """The learners of all agents, side by side; or one, if they share their parameters."""
 
     def __init__(self, args: Args, grid: Grid, streams: Streams) -> None:
-        self.network = make_network(args, grid, torch_generator(streams.network))
-        self.spec = self.network.spec
-        targets = make_network(args, grid, torch.Generator()).members
-        n_learners = len(self.network.members)
-        self.learners = [
-            AgentLearner(args, grid, network, target, agent, args.n_agents // n_learners, seeds)
-            for agent, (network, target, seeds) in enumerate(
-                zip(self.network.members, targets, streams.replay.spawn(n_learners), strict=True)
-            )
-        ]
-
-    # -- acting
+        team = "shared" if args.share_parameters else "independent"
+        spec = spec_from_options(args, args.network, grid, team=team)
+        self.network = build_network(spec, torch_generator(streams.network))
+        self.spec = spec
+        members, targets = self.network.members, build_network(spec).members
+        seeds = streams.replay.spawn(len(members))
+        self.learners = []
+        for agent, (network, target) in enumerate(zip(members, targets, strict=True)):
+            replay = make_replay(args, grid, spec, agent, args.n_agents // len(members))
+            rng = np.random.default_rng(seeds[agent])
+            self.learners.append(AgentLearner(args, grid, network, target, replay, rng))
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return each agent's own greedy action (N,)."""
         with torch.inference_mode():
             return greedy_actions(self.network(torch.from_numpy(observation[None])), self.spec)[0]
-
-    def policy(self) -> NetworkPolicy:
-        """Return what was learned."""
-        return NetworkPolicy(self.network)
-
-    # -- learning
 
     def remember(
         self,
@@ -343,11 +221,11 @@ class IndependentLearners:
         next_observation: np.ndarray,
         terminated: bool,
     ) -> None:
-        """Hand every agent's learner what that agent saw, did and got."""
-        for agent, action in enumerate(actions.tolist()):
-            self.learners[agent % len(self.learners)].remember(
+        """Store for every agent what that agent saw, did and got; never what the others did."""
+        for agent in range(self.spec.n_agents):
+            self.learners[agent % len(self.learners)].replay.add(
                 view(observation, agent, self.spec),
-                action,
+                actions[[agent]],
                 reward,
                 view(next_observation, agent, self.spec),
                 terminated,
@@ -356,7 +234,7 @@ class IndependentLearners:
     @property
     def ready(self) -> bool:
         """Whether there is something to learn from."""
-        return all(learner.ready for learner in self.learners)
+        return all(learner.replay.ready for learner in self.learners)
 
     def update(self, progress: float) -> float:
         """One update of every learner; return their mean loss."""
@@ -366,6 +244,10 @@ class IndependentLearners:
     def updates(self) -> int:
         """Updates of each learner."""
         return self.learners[0].updates
+
+    def policy(self) -> NetworkPolicy:
+        """Return what was learned."""
+        return NetworkPolicy(self.network)
 
     # -- checkpoints
 
@@ -390,7 +272,7 @@ class IndependentLearners:
 
 def main(args: Args) -> int:
     """Train, evaluate, draw; return the exit code."""
-    return run_experiment(args, ALGORITHM, IndependentLearners)
+    return train_learner(args, ALGORITHM, IndependentLearners)
 
 
 if __name__ == "__main__":

@@ -15,15 +15,12 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
 
-from baselines.policies.evaluation import evaluate
-from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import Setting
-from baselines.policies.trained import load_trained
-from mapp_env import Plan, Problem, replay, solve
+from baselines.policies import play
+from baselines.policies.settings import load_run
+from mapp_env import Plan, Problem, solve
 
 
 @dataclass
@@ -40,27 +37,8 @@ class Args:
     """where to write the policy's plan: a JSON file"""
     animation: Path | None = None
     """where to play the policy beside the optimum: an animated .gif file"""
-
-
-def make_problem(setting: Setting, landmarks: tuple[int, ...]) -> Problem:
-    """Return the problem of some landmarks.
-
-    Raises
-    ------
-    ValueError
-        If there are not as many as the policy was trained for, or one cannot be.
-    """
-    if len(landmarks) != setting.n_landmarks:
-        raise ValueError(
-            f"landmarks must be {setting.n_landmarks} cells for this policy, got {len(landmarks)}"
-        )
-    return Problem(setting.grid, landmarks, setting.n_agents, setting.max_cycles)
-
-
-def solve_by_policy(policy: NetworkPolicy, setting: Setting, problem: Problem) -> Plan:
-    """Return what the rules make of a policy's greedy episode."""
-    played = evaluate(policy, setting, np.array([problem.landmarks]), n_kept=1)
-    return replay(problem, played.actions[: played.steps[0], 0])
+    device: str = "cpu"
+    """where the network computes, as PyTorch names it"""
 
 
 def describe(label: str, plan: Plan) -> str:
@@ -93,6 +71,7 @@ def proof(plan: Plan) -> str:
 
 def save(args: Args, problem: Problem, plans: dict[str, Plan], optimum: Plan) -> None:
     """Write what was asked for, of the last plan and the optimum."""
+    beside = {**plans, proof(optimum): optimum}
     if args.plan is not None:
         list(plans.values())[-1].save(args.plan)
         print(f"plan: {args.plan}")
@@ -100,22 +79,22 @@ def save(args: Args, problem: Problem, plans: dict[str, Plan], optimum: Plan) ->
         # Only here: drawing takes longer to import than all the rest to run.
         from mapp_env.rendering import compare_plans
 
-        compare_plans(problem, {**plans, proof(optimum): optimum}, args.picture)
+        compare_plans(problem, beside, args.picture)
         print(f"picture: {args.picture}")
     if args.animation is not None:
         from mapp_env.rendering import animate_plans
 
-        size = animate_plans(args.animation, problem, {**plans, proof(optimum): optimum})
+        size = animate_plans(args.animation, problem, beside)
         print(f"animation: {args.animation}, {size:,} bytes")
 
 
 def main(args: Args) -> int:
     """Solve one problem; return the exit code."""
     torch.set_num_threads(1)
-    policy, setting, _ = load_trained(args.policy)
-    problem = make_problem(setting, args.landmarks)
+    policy, setting, _ = load_run(args.policy, args.device)
+    problem = setting.problem(args.landmarks)
     start = time.perf_counter()
-    plan = solve_by_policy(policy, setting, problem)
+    (plan,) = play(policy, [problem])
     seconds = time.perf_counter() - start
     optimum = solve(problem)
     report(problem, {"policy": plan}, optimum)

@@ -1,11 +1,11 @@
-"""How fast the environments step, as ratios to peers measured in the same run.
+"""Measure how fast the environments step, next to peers in the same run.
 
-Absolute figures drift with the machine and with what else runs on it, so every figure is printed
-beside a floor: a `ParallelEnv` that does nothing, the most that PettingZoo's dictionaries allow.
-The two are timed in turns, in CPU seconds of this process, and the ratio is the median over turns.
-Random actions, resets included, one thread.
+Absolute figures vary with the machine and its load, so every figure is printed with its ratio to a
+floor: a `ParallelEnv` that does nothing, the most that PettingZoo's dictionaries allow. The two are
+timed alternately, in CPU seconds of this process, and the ratio is the median over rounds. Random
+actions, including resets, one thread.
 
-    python benchmarks/env_speed.py            # a minute; --seconds 0.1 for a glance
+    python benchmarks/env_speed.py            # a minute; --seconds 0.1 for a quick look
 """
 
 from __future__ import annotations
@@ -125,14 +125,14 @@ def vector_stepper(num_envs: int, mode: str) -> Callable[[int], int]:
 
 
 def rate(take: Callable[[int], int], n_steps: int) -> float:
-    """Return steps a CPU second."""
+    """Return steps per CPU second."""
     started = time.process_time()
     taken = take(n_steps)
     return taken / (time.process_time() - started)
 
 
 def compare(takers: dict[str, Callable[[int], int]], floor: str, seconds: float) -> dict[str, Any]:
-    """Time everything in turns; return each one's median rate and median ratio to the floor."""
+    """Time everything alternately; return each median rate and median ratio to the floor."""
     n_steps = {}
     for name, take in takers.items():
         take(100)
@@ -151,7 +151,7 @@ def compare(takers: dict[str, Callable[[int], int]], floor: str, seconds: float)
 
 
 def peers() -> dict[str, Callable[[int], int]]:
-    """Return the peers that are installed, at about this environment's size."""
+    """Return the installed peers, at about this environment's size."""
     found: dict[str, Callable[[int], int]] = {}
     makers: dict[str, Callable[[], Callable[[int], int]]] = {
         "pogema 8x8, 3 agents, PettingZoo": _pogema,
@@ -198,7 +198,7 @@ print(imported - started, time.perf_counter() - imported)
 
 
 def start_times() -> None:
-    """Print how long import and the first step take, without and with compiled kernels at hand."""
+    """Print how long import and the first step take, without and with cached kernels."""
     with tempfile.TemporaryDirectory() as cache:
         environ = {**os.environ, "NUMBA_CACHE_DIR": cache}
         environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -221,7 +221,7 @@ def main() -> None:
     """Print one table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
-        "--seconds", type=float, default=1.5, help="CPU seconds for each line (default 1.5)"
+        "--seconds", type=float, default=1.5, help="CPU seconds per line (default 1.5)"
     )
     arguments = parser.parse_args()
     floor = "do-nothing ParallelEnv, 3 agents"
@@ -245,7 +245,7 @@ def main() -> None:
 
 
 def aec_stepper(env: Any) -> Callable[[int], int]:
-    """Step agent by agent through PettingZoo's AEC form; n counts agents' steps."""
+    """Return the same for the AEC environment; n counts the steps of single agents."""
     env.reset(seed=0)
 
     def take(n_steps: int) -> int:

@@ -1,11 +1,11 @@
-"""How soon an answer is there: trained networks beside the solvers, on one core.
+"""Measure the latency of trained networks and of the solvers on one core.
 
 Random problems of `paper-7x7`, three agents, five landmarks, cover time. "one problem" is the
-median time from a problem to its plan, one problem after another; a network's "one step" is what
-somebody waits for who asks it for the next joint action only. "in batches" is the time for each of
-many problems that are handed over together: of a network with the rules to play its episodes, of
-the exact solver for the costs alone. Searches end when they have found the optimum, which they do
-not know themselves. All is loaded and compiled before; times drift with the machine.
+median time from a problem to its plan, one problem after another; a network's "one step" is the
+time to the next joint action alone. "in batches" is the time per problem when many are solved
+together: for a network including the playing of its episodes, for the exact solver costs only.
+Searches are timed until they find the optimum, although they cannot know that they have. Everything
+is loaded and compiled beforehand; times vary with the machine.
 
     python benchmarks/latency.py                          # half a minute
     python benchmarks/latency.py --policies pretrained runs/mine
@@ -29,8 +29,9 @@ import numpy as np
 import torch
 
 from baselines.policies.acting import Acting, check_grid
-from baselines.policies.evaluation import Optima, evaluate, find_optima, rules_of_thumb
+from baselines.policies.evaluation import Optima, evaluate, find_optima
 from baselines.policies.policy import NetworkPolicy, load_policy, pretrained_names
+from baselines.policies.rules_of_thumb import rules_of_thumb
 from baselines.policies.settings import Setting
 from mapp_env import Problem, make_grid, replay, sample_problems, solve
 from mapp_env.solvers import optimal_costs
@@ -46,11 +47,11 @@ class Row(NamedTuple):
     label: str
     one: float  # milliseconds
     each: float | None  # microseconds
-    optimal: float | None  # per cent of the problems
+    optimal: float | None  # percent of the problems
 
 
 def time_each(function: Callable[[Problem], object], problems: list[Problem]) -> float:
-    """Return the median milliseconds that a function takes."""
+    """Return a function's median time in milliseconds."""
     times = []
     for problem in problems:
         start = time.perf_counter()
@@ -60,7 +61,7 @@ def time_each(function: Callable[[Problem], object], problems: list[Problem]) ->
 
 
 def time_batch(function: Callable[[np.ndarray], object], landmarks: np.ndarray) -> float:
-    """Return microseconds for each problem, the best of three."""
+    """Return microseconds per problem, the best of three."""
     times = []
     for _ in range(3):
         start = time.perf_counter()
@@ -70,7 +71,7 @@ def time_batch(function: Callable[[np.ndarray], object], landmarks: np.ndarray) 
 
 
 def time_search(solver: Callable[..., object], problem: Problem, optimum: int) -> float:
-    """Return the milliseconds until a search has found the optimum; infinite if not in 0.2 s."""
+    """Return the milliseconds until a search finds the optimum; infinite if not within 0.2 s."""
     found = [float("inf")]
     start = time.perf_counter()
 
@@ -108,12 +109,12 @@ def policy_rows(
 
 
 def load_fitting(name: str) -> NetworkPolicy:
-    """Load a policy of the benchmark's setting.
+    """Load a policy for the benchmark's setting.
 
     Raises
     ------
     ValueError
-        If there is none, or it is for another.
+        If there is no such policy, or it is for another setting.
     """
     policy = load_policy(name)
     try:
@@ -132,9 +133,9 @@ def load_fitting(name: str) -> NetworkPolicy:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--policies", nargs="*", default=pretrained_names(), help="of networks")
-    parser.add_argument("--problems", type=int, default=100, help="one after another")
-    parser.add_argument("--batch", type=int, default=20_000, help="handed over together")
+    parser.add_argument("--policies", nargs="*", default=pretrained_names(), help="networks")
+    parser.add_argument("--problems", type=int, default=100, help="problems solved singly")
+    parser.add_argument("--batch", type=int, default=20_000, help="problems solved together")
     args = parser.parse_args()
     try:
         policies = {name: load_fitting(name) for name in args.policies}

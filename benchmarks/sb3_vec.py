@@ -1,9 +1,10 @@
-"""What Stable-Baselines3's form costs: its VecEnv beside the engine that it steps.
+"""Measure the overhead of the Stable-Baselines3 VecEnv over the engine that it steps.
 
-In turns, in CPU seconds of this process, random actions, resets included, one thread; each figure
-beside the plain engine of as many rows, in the same-step mode, and the ratio the median over turns.
+Timed alternately, in CPU seconds of this process, with random actions, including resets, one
+thread. Each figure is printed with the ratio to the plain engine with the same number of rows in
+same-step mode, the median over rounds.
 
-    python benchmarks/sb3_vec.py              # half a minute; --seconds 0.2 for a glance
+    python benchmarks/sb3_vec.py              # half a minute; --seconds 0.2 for a quick look
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ OBSERVATIONS = ("global", "geodesic")
 
 
 def stepper(envs: Any, actions: np.ndarray, rows: int) -> Callable[[float], float]:
-    """Return a function that steps for some CPU seconds and returns env-steps a second."""
+    """Return a function that steps for some CPU seconds and returns env-steps per second."""
     for joint_actions in actions:  # spread the rows over their episodes
         envs.step(joint_actions)
 
@@ -54,7 +55,7 @@ def stepper(envs: Any, actions: np.ndarray, rows: int) -> Callable[[float], floa
 
 
 def make_steppers(rows: int, observation: str) -> dict[str, Callable[[float], float]]:
-    """Return the engine, its VecEnv, and for few rows what there is without it."""
+    """Return the engine, its VecEnv and, for few rows, the alternatives to it."""
     rng = np.random.default_rng(0)
     actions = rng.integers(0, 4, (64, rows, 3))
     engine = mapp_env.make_vec(rows, autoreset_mode="SameStep", observation=observation)
@@ -81,7 +82,7 @@ def main() -> None:
     """Print one table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
-        "--seconds", type=float, default=1.5, help="CPU seconds for each line (default 1.5)"
+        "--seconds", type=float, default=1.5, help="CPU seconds per line (default 1.5)"
     )
     arguments = parser.parse_args()
     print(f"{'rows':>5} {'observation':<10} {'':<28}{'env-steps/CPU s':>16}{'of make_vec':>13}")

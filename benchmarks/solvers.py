@@ -1,11 +1,12 @@
-"""What the solvers find, how soon, and how far from the best known: one table.
+"""Compare the solvers: the costs they find, how soon, and how far from the best known.
 
 Landmarks are drawn at random on `paper-7x7` and on generated grids. "best known" is the proven
-optimum where the exact solver can take the problem, else the best of all methods and of a search of
-three times the time with another seed; "proven" is a cost that meets a lower bound. Searches end
-early then. One thread; times include the distances between landmarks, and drift with the machine.
+optimum where the exact solver can handle the problem, otherwise the best of all methods and of a
+search with another seed for three times as long; "proven" means that the cost meets a lower bound,
+which ends a search early. One thread; times include computing the distances between landmarks, and
+vary with the machine.
 
-    python benchmarks/solvers.py            # five minutes; --seconds 0.2 --instances 1 for a glance
+    python benchmarks/solvers.py            # five minutes; quick: --seconds 0.2 --instances 1
     python benchmarks/solvers.py --grid rooms --objective makespan
 """
 
@@ -41,19 +42,19 @@ SIZES = (  # side of the grid, landmarks, agents
     (64, 100, 3),
     (64, 100, 5),
 )
-REFERENCE = 3  # times as long as the others, for what cannot be solved exactly
+REFERENCE = 3  # times as long as the others, where the exact solver cannot be used
 
 
 class Found(NamedTuple):
-    """What a method found."""
+    """A method's result."""
 
     cost: int
-    seconds: float  # until then
+    seconds: float  # until it was found
     proven: bool = False  # to be the optimum
 
 
 def draw_problem(kind: str, side: int, n_landmarks: int, n_agents: int, seed: int) -> Problem:
-    """Return the problem of a seed."""
+    """Return the problem for a seed."""
     options = {"rows": side, "cols": side, "seed": seed}
     grid = make_grid("paper-7x7") if side == 7 else make_grid(kind, **options)
     rng = np.random.default_rng([side, n_landmarks, seed])
@@ -68,19 +69,19 @@ def exact(problem: Problem, objective: str, seconds: float) -> Found:
 
 
 def search(problem: Problem, objective: str, seconds: float, seed: int = 0) -> Found:
-    """Ruin and recreate for so many seconds."""
+    """Run ruin and recreate for some seconds."""
     return watch(solve_search, problem, objective, seconds, seed)
 
 
 def pyvrp(problem: Problem, objective: str, seconds: float) -> Found:
-    """PyVRP for so many seconds."""
+    """Run PyVRP for some seconds."""
     return watch(solve_pyvrp, problem, objective, seconds, 0)
 
 
 def watch(
     solver: Callable[..., Solution], problem: Problem, objective: str, seconds: float, seed: int
 ) -> Found:
-    """Return the smallest cost that a search reports, and when it did."""
+    """Return the lowest cost that a search reports, and when."""
     start = time.perf_counter()
     best: list[Found] = []
     solution = solver(
@@ -94,13 +95,13 @@ def watch(
 
 
 def earliest_arrival(problem: Problem, objective: str, seconds: float) -> Found:
-    """Let the agent that can be first on a landmark go there, until all are visited."""
+    """Assign landmarks one at a time, each to the agent that can reach it first."""
     start = time.perf_counter()
     distances = landmark_distances(problem)
     n_agents = 1 if objective == "total_distance" else problem.n_agents
     nodes = np.arange(1, len(distances))[None]
     _, when = assign_landmarks(distances, np.zeros((1, n_agents), int), nodes, nodes > 0)
-    # An agent's last landmark counts by itself: from no earlier one is it home later.
+    # The maximum is reached at an agent's last landmark: from no earlier one is it home later.
     ends = when[0] if objective == "cover_time" else when[0] + distances[1:, 0]
     return Found(int(ends.max()), time.perf_counter() - start)
 
@@ -114,7 +115,7 @@ METHODS: dict[str, Callable[[Problem, str, float], Found]] = {
 
 
 def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list[str]:
-    """Return one line of the table for each method."""
+    """Return one table line per method."""
     small = len(problems[0].landmarks) <= MAX_EXACT_LANDMARKS
     found: dict[str, list[Found]] = {}
     for name, method in METHODS.items():
@@ -126,7 +127,7 @@ def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list
     best = [min(results).cost for results in zip(*found.values(), strict=True)]
     if small:
         if best != [result.cost for result in found["exact"]]:
-            raise RuntimeError("a method has found less than the optimum")
+            raise RuntimeError("a method found a cost below the optimum")
     else:
         longer = [search(problem, objective, REFERENCE * seconds, seed=1) for problem in problems]
         best = [min(one, other.cost) for one, other in zip(best, longer, strict=True)]
@@ -145,12 +146,12 @@ def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--seconds", type=float, default=1.0, help="of each search")
-    parser.add_argument("--instances", type=int, default=3, help="of each size")
+    parser.add_argument("--seconds", type=float, default=1.0, help="seconds per search")
+    parser.add_argument("--instances", type=int, default=3, help="problems per size")
     parser.add_argument("--grid", default="random", help="generator of the larger grids")
     parser.add_argument("--objective", choices=OBJECTIVES, help="only this one")
     args = parser.parse_args()
-    # Compile, and load what is compiled, outside the times.
+    # Compile and load kernels before timing.
     for objective in OBJECTIVES:
         compare([draw_problem(args.grid, 7, 3, 2, 0)], objective, 0.01)
     print(

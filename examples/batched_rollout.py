@@ -17,7 +17,7 @@ def main() -> None:
     """Print success, mean cover time and speed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--num-envs", type=int, default=4096, help="rows (default 4096)")
-    parser.add_argument("--steps", type=int, default=500, help="steps of each row (default 500)")
+    parser.add_argument("--steps", type=int, default=500, help="steps per row (default 500)")
     arguments = parser.parse_args()
 
     envs = mapp_env.make_vec(arguments.num_envs, autoreset_mode="SameStep")

@@ -1,7 +1,7 @@
-"""BenchMARL: a Task for ``mapp_env``, and IQL, VDN or QMIX trained on it for about a minute.
+"""BenchMARL: a task for ``mapp_env``, and IQL, VDN or QMIX trained on it for about a minute.
 
-BenchMARL 1.5 needs TorchRL below 0.12, the tests a newer one: it gets a virtual environment of its
-own, with the versions of ``constraints.txt`` for everything else. Usage::
+BenchMARL 1.5 needs TorchRL below 0.12, but the tests need a newer one: install it in a separate
+virtual environment, with the versions of ``constraints.txt`` for everything else. Usage::
 
     python3 -m venv .venv-benchmarl
     grep -vE "^(torchrl|tensordict)=" constraints.txt > .venv-benchmarl/constraints.txt
@@ -12,13 +12,13 @@ own, with the versions of ``constraints.txt`` for everything else. Usage::
 
 This installed torchrl 0.11.1, tensordict 0.11.0, torchvision 0.28.0 and torch 2.13.0.
 
-IQL: each agent learns from the team's reward by itself; VDN: the sum of the agents' values is
-taught to be the team's; QMIX: a mixing network, monotonous in each agent's value and told the
-state, in place of the sum. The agents share one network in all three, BenchMARL's for sets: here of
-the landmarks that an agent sees.
+IQL: each agent learns from the team's reward independently; VDN: the sum of the agents' values is
+trained to be the team's value; QMIX: in place of the sum, a mixing network that is monotonic in
+each agent's value and receives the state. In all three the agents share one network, BenchMARL's
+model for sets, here sets of landmarks.
 
-Output: the mean return of the training episodes every thousand steps; then the greedy policy before
-and after on unseen problems, beside their proven optimum.
+Output: the mean return of the training episodes every thousand steps; then the greedy policy on
+unseen problems before and after training, compared with the proven optima.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Args:
     """Options of the training."""
 
     algorithm: Literal["iql", "vdn", "qmix"] = "vdn"
-    """who learns"""
+    """learning algorithm"""
     seed: int = 0
     """seed of problems, exploration and weights"""
     steps: int = 8000
@@ -67,22 +67,22 @@ class Args:
     updates_per_batch: int = 30
     """updates after that"""
     batch_size: int = 128
-    """transitions an update learns from"""
+    """transitions per update"""
     reward: Literal["manhattan", "geodesic", "step"] = "geodesic"
     """the team reward"""
     discount: float = 0.9
     """discount factor of future rewards"""
     learning_rate: float = 0.001
-    """step size of Adam"""
+    """learning rate of Adam"""
     hidden_units: int = 64
     """rectifier units in a hidden layer"""
     explore: float = 0.1
-    """share of random actions when half of the steps are played; it falls to this from 1"""
+    """final share of random actions; decreases from 1 during the first half of the steps"""
     problems: int = 500
-    """unseen problems to judge the policy on"""
+    """unseen problems to evaluate on"""
 
 
-# -- the task: what a BenchMARL user copies ----------------------------------------------------
+# -- the task: for BenchMARL users to copy -----------------------------------------------------
 
 
 def as_set(observations: torch.Tensor, n_landmarks: int) -> torch.Tensor:
@@ -91,7 +91,7 @@ def as_set(observations: torch.Tensor, n_landmarks: int) -> torch.Tensor:
 
 
 class MappTask(TaskClass):
-    """``mapp_env`` as BenchMARL asks for it; the config holds the arguments of ``parallel_env``."""
+    """``mapp_env`` as a BenchMARL task; the config holds the arguments of ``parallel_env``."""
 
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
@@ -114,7 +114,7 @@ class MappTask(TaskClass):
         return True
 
     def has_render(self, env: EnvBase) -> bool:
-        """Return whether the environment was made with pictures."""
+        """Return whether the environment renders RGB frames."""
         return self.config.get("render_mode") == "rgb_array"
 
     def max_steps(self, env: EnvBase) -> int:
@@ -132,26 +132,26 @@ class MappTask(TaskClass):
         return Composite({GROUP: spec})
 
     def observation_spec(self, env: EnvBase) -> Composite:
-        """Return what the agents see."""
+        """Return the spec of the observations."""
         return self._only(env, "observation")
 
     def action_mask_spec(self, env: EnvBase) -> Composite:
-        """Return which moves do not bump."""
+        """Return the spec of the action masks."""
         return self._only(env, "action_mask")
 
     def info_spec(self, env: EnvBase) -> None:
-        """Return None: there is nothing but the masks."""
+        """Return None: the masks are the only info."""
 
     def state_spec(self, env: EnvBase) -> Composite:
-        """Return the global observation, for QMIX's mixer."""
+        """Return the spec of the global observation, for QMIX's mixer."""
         return Composite({"state": env.observation_spec["state"].clone()})
 
     def action_spec(self, env: EnvBase) -> Composite:
-        """Return what the agents do."""
+        """Return the spec of the actions."""
         return env.full_action_spec
 
     def get_env_transforms(self, env: EnvBase) -> list[Transform]:
-        """Return what makes "geodesic" a set of landmarks, for BenchMARL's model of sets."""
+        """Return the transform of "geodesic" into a set of landmarks, for BenchMARL's set model."""
         if self.config.get("observation") != "geodesic":
             return []
         key = GROUP, "observation"
@@ -178,7 +178,7 @@ class MappEnvTask(Task):
 
 
 class Report(Callback):
-    """Prints the mean return of the episodes that ended, every thousand steps; keeps problems."""
+    """Prints the mean return of finished episodes every thousand steps; records problems met."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -188,7 +188,7 @@ class Report(Callback):
         self.steps = 0
 
     def on_batch_collected(self, batch: TensorDictBase) -> None:
-        """Read the episodes' returns, which BenchMARL sums up for each agent, and the problems."""
+        """Read the episodes' returns, which BenchMARL sums per agent, and the problems."""
         task = self.experiment.test_env.task
         places = slice(task.n_agents, task.n_agents + task.n_landmarks)
         self.met.update(map(tuple, batch["state"][..., places].flatten(0, -2).int().tolist()))
@@ -205,7 +205,7 @@ class Report(Callback):
 
 
 def make_model(args: Args) -> DeepsetsConfig:
-    """Return the agents' network: BenchMARL's for sets, here of landmarks."""
+    """Return the agents' network: BenchMARL's set model, here for sets of landmarks."""
     model = DeepsetsConfig.get_from_yaml()
     model.local_nn_num_cells = model.global_nn_num_cells = [args.hidden_units]
     model.out_features_local_nn = args.hidden_units
@@ -214,7 +214,7 @@ def make_model(args: Args) -> DeepsetsConfig:
 
 
 def make_config(args: Args, folder: str) -> ExperimentConfig:
-    """Return BenchMARL's settings of an experiment: its defaults, but for these."""
+    """Return BenchMARL's experiment config: its defaults, except for these."""
     config = ExperimentConfig.get_from_yaml()
     config.gamma, config.lr, config.polyak_tau = args.discount, args.learning_rate, 0.01
     config.exploration_eps_init, config.exploration_eps_end = 1.0, args.explore
@@ -231,7 +231,7 @@ def make_config(args: Args, folder: str) -> ExperimentConfig:
 
 
 def judge_experiment(experiment: Experiment, landmarks: np.ndarray, **arguments: Any) -> Judgement:
-    """Let the agents act greedily on problems."""
+    """Evaluate the greedy policy."""
 
     def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         views = TensorDict(
@@ -248,8 +248,8 @@ def judge_experiment(experiment: Experiment, landmarks: np.ndarray, **arguments:
 
 
 def main(args: Args) -> None:
-    """Train, and judge before and after."""
-    # TorchRL names the one PettingZoo version of 2024 that it tests with.
+    """Train, and evaluate before and after."""
+    # TorchRL warns that it tests with one PettingZoo version, from 2024.
     warnings.filterwarnings("ignore", "PettingZoo in TorchRL is tested", UserWarning)
     arguments = {"observation": "geodesic", "reward": args.reward}
     algorithm = ALGORITHMS[args.algorithm].get_from_yaml()

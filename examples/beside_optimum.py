@@ -1,12 +1,12 @@
-"""Any trainer's policy on problems it has not met, each beside its proven optimum.
+"""Evaluate any trainer's policy on unseen problems and compare it with the proven optima.
 
-Usage, here with random moves that do not bump::
+Usage, here with random moves that never bump::
 
     python examples/beside_optimum.py --problems 200
 
-Other scripts of this folder import :func:`judge`, or :func:`report`, which prints it. It plays all
-problems side by side, so that a network is asked once a step for all of them. Needs ``mapp_env``
-alone.
+The other scripts in this folder import :func:`judge`, or :func:`report`, which prints its result.
+All problems are played in parallel, so a network needs one forward pass per step for all of them.
+Needs only ``mapp_env``.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ Acting = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class Judgement(NamedTuple):
-    """What a policy did on P problems."""
+    """A policy's results on P problems."""
 
-    solved: float  # per cent
-    gap: float  # per cent: cover time over its optimum, mean of the solved problems; NaN if none
-    mean_return: float  # undiscounted, of all problems
+    solved: float  # percent
+    gap: float  # percent: cover time above the optimum, mean over solved problems; NaN if none
+    mean_return: float  # undiscounted, over all problems
 
     def __str__(self) -> str:
         gap = "-" if math.isnan(self.gap) else f"{self.gap:.1f} %"
@@ -40,9 +40,9 @@ class Judgement(NamedTuple):
 def unseen_landmarks(
     n_problems: int, seen: Iterable[Sequence[int]] = (), seed: int = 0, **arguments: Any
 ) -> np.ndarray:
-    """Draw distinct problems, none of them in `seen`: landmark cells, shape (n_problems, K).
+    """Draw distinct problems that are not in `seen`: landmark cells, shape (n_problems, K).
 
-    `arguments` are those of ``parallel_env``.
+    `arguments` are passed to ``parallel_env``.
     """
     task = mapp_v0.parallel_env(**arguments).task
     return sample_problems(
@@ -58,9 +58,9 @@ def judge(act: Acting, landmarks: np.ndarray, **arguments: Any) -> Judgement:
     act
         The policy.
     landmarks
-        (P, K) landmark cells, a problem a row.
+        (P, K) landmark cells, one problem per row.
     arguments
-        Those of ``parallel_env``: what the policy sees, and the reward that is counted.
+        Passed to ``parallel_env``: what the policy sees, and the reward that is counted.
     """
     envs = [mapp_v0.parallel_env(**arguments) for _ in landmarks]
     seen = [
@@ -91,7 +91,7 @@ def judge(act: Acting, landmarks: np.ndarray, **arguments: Any) -> Judgement:
 
 
 def check_options(seconds: float, n_problems: int) -> None:
-    """End the program, before it trains, if it could not be reported what comes of it."""
+    """Exit before training if the options would leave nothing to report."""
     if not seconds > 0:
         raise SystemExit(f"error: --seconds must be above 0, got {seconds}")
     if n_problems < 1:
@@ -101,22 +101,22 @@ def check_options(seconds: float, n_problems: int) -> None:
 def report(
     seconds: float, returns: Sequence[float], act: Acting, n_problems: int, **arguments: Any
 ) -> None:
-    """Print what a training has come to: returns of its first and last episodes, and a judgement.
+    """Print a training run's results: first and last returns, and an evaluation of the policy.
 
     Parameters
     ----------
     seconds
-        How long it took.
+        Duration of the run.
     returns
-        Undiscounted, of the training's episodes in order, at least one. Their problems are taken
-        to be random ones, so that some of those judged on will have been met: as large a share as
-        the episodes are of all problems, fewer if problems were met twice.
+        Undiscounted returns of the training episodes, in order, at least one. Their problems are
+        assumed to be random, so some of the evaluation problems will have been met: at most the
+        share of all problems that were played.
     act
-        The policy, greedy.
+        The greedy policy.
     n_problems
-        On how many problems it is judged.
+        Number of problems to evaluate on.
     arguments
-        Those of ``parallel_env``: what the policy sees, and the reward that is counted.
+        Passed to ``parallel_env``: what the policy sees, and the reward that is counted.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def report(
         If no episode has ended.
     """
     if len(returns) == 0:
-        raise ValueError("returns must hold those of at least one episode, got none: train longer")
+        raise ValueError("returns must have at least one episode, got none: train longer")
     count = max(1, min(200, len(returns) // 2))
     first, last = np.mean(returns[:count]), np.mean(returns[-count:])
     print(f"{len(returns)} episodes in {seconds:.0f} CPU seconds")
@@ -136,9 +136,9 @@ def report(
 
 
 def main() -> None:
-    """Judge random moves."""
+    """Evaluate random moves."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--problems", type=int, default=200, help="how many (default 200)")
+    parser.add_argument("--problems", type=int, default=200, help="problems to play (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the moves (default 0)")
     arguments = parser.parse_args()
     generator = np.random.default_rng(arguments.seed)

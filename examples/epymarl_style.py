@@ -1,10 +1,10 @@
-"""VDN in EPyMARL's manner, in plain PyTorch, on `mapp_env/Tuple-v0`.
+"""EPyMARL-style VDN in plain PyTorch, on `mapp_env/Tuple-v0`.
 
-EPyMARL is no package that pip finds, so this is its loop in small, on the environment that it takes
+EPyMARL is not on PyPI, so this is a small version of its loop, on the environment that it accepts
 (`env_args.key="mapp_env:mapp_env/Tuple-v0"`): whole episodes in a replay memory, one network with
-the agent's number as an input, the team's value the sum of the agents' values, an update after each
-episode. Rewards of the last step arrive, and a time-out is not taken for an end. What it reached is
-in docs/trainers.md.
+the agent's index as an input, the team's value as the sum of the agents' values, an update after
+each episode. Rewards of the last step are kept, and a truncation is not treated as a termination.
+Results are in docs/trainers.md.
 
     python examples/epymarl_style.py              # a minute of CPU time
     python examples/epymarl_style.py --no-mix     # independent learners (IQL); --help for more
@@ -37,41 +37,41 @@ class Args:
     seed: int = 0
     """seed of network, exploration and problems"""
     mix: bool = True
-    """learn the sum of the agents' values (VDN); without, each agent's by itself (IQL)"""
+    """learn the sum of the agents' values (VDN); otherwise each agent's separately (IQL)"""
     learning_rate: float = 1e-3
-    """of Adam"""
+    """learning rate of Adam"""
     reward_scale: float = 0.05
-    """what rewards are multiplied with: a step's may be -30"""
+    """factor for rewards, which may be -30 in one step"""
     discount: float = 0.9
-    """of a step"""
+    """discount per step"""
     batch_episodes: int = 16
-    """episodes in an update"""
+    """episodes per update"""
     memory_episodes: int = 2000
     """episodes kept"""
     target_updates: int = 50
-    """updates after which the target network is renewed"""
+    """updates between copies to the target network"""
 
 
 class Episodes:
-    """The last episodes: what was seen (one more than steps), done, given, and whether it ended."""
+    """Replay memory of whole episodes: observations (T + 1), actions, rewards, terminations."""
 
     def __init__(self, size: int, limit: int, n_agents: int, n_features: int) -> None:
         self.seen = np.zeros((size, limit + 1, n_agents, n_features), np.float32)
         self.actions = np.zeros((size, limit, n_agents), np.int64)
         self.rewards = np.zeros((size, limit, n_agents), np.float32)
-        self.ended = np.zeros((size, limit), np.float32)  # by the rules, not by the clock
+        self.ended = np.zeros((size, limit), np.float32)  # terminated, not truncated
         self.filled = np.zeros((size, limit), np.float32)
         self.count = 0
 
     def place(self) -> int:
-        """Return where the next episode goes, emptied."""
+        """Return the cleared slot for the next episode."""
         index = self.count % len(self.seen)
         self.count += 1
         self.filled[index] = self.ended[index] = 0.0
         return index
 
     def sample(self, n: int, rng: np.random.Generator) -> list[torch.Tensor]:
-        """Return n random episodes, as long as the longest of them."""
+        """Return n random episodes, padded to the longest of them."""
         rows = rng.integers(0, min(self.count, len(self.seen)), n)
         steps = int(self.filled[rows].sum(1).max())
         parts = (self.actions, self.rewards, self.ended, self.filled)
@@ -82,14 +82,14 @@ class Episodes:
 
 
 def make_network(n_features: int, n_actions: int) -> nn.Module:
-    """Return the network of all agents: features and the agent's number -> values of actions."""
+    """Return the shared network: features and the agent's index -> action values."""
     return nn.Sequential(
         nn.Linear(n_features, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, n_actions)
     )
 
 
 def with_numbers(observations: np.ndarray) -> np.ndarray:
-    """Append each agent's number, one-hot: (..., N, F) -> (..., N, F + N)."""
+    """Append each agent's one-hot index: (..., N, F) -> (..., N, F + N)."""
     n_agents = observations.shape[-2]
     numbers = np.broadcast_to(
         np.eye(n_agents, dtype=np.float32), (*observations.shape[:-1], n_agents)
@@ -100,7 +100,7 @@ def with_numbers(observations: np.ndarray) -> np.ndarray:
 def find_loss(
     batch: list[torch.Tensor], network: nn.Module, target: nn.Module, args: Args
 ) -> torch.Tensor:
-    """Return the mean Huber loss of double Q-learning over the steps that were played."""
+    """Return the mean double Q-learning Huber loss over the steps played."""
     seen, actions, rewards, ended, filled = batch
     values = network(seen)  # (E, T + 1, N, A)
     chosen = values[:, :-1].gather(3, actions[..., None])[..., 0]
@@ -123,7 +123,7 @@ def play(
     epsilon: float,
     rng: np.random.Generator,
 ) -> float:
-    """Play one episode into the memory; return its return."""
+    """Play one episode into the memory and give its undiscounted return."""
     row, step, total = memory.place(), 0, 0.0
     observations, _ = env.reset()
     terminated = truncated = False
@@ -143,7 +143,7 @@ def play(
 
 
 def main(args: Args) -> None:
-    """Train and print what was reached."""
+    """Train and print the results."""
     check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     torch.manual_seed(args.seed)

@@ -1,21 +1,21 @@
-"""Search the default preset's main settings with Ray Tune, and stop early what does not keep up.
+"""Search the default preset's main settings with Ray Tune, stopping weak trials early.
 
     pip install -c constraints.txt -e ".[baselines,ray]"
     python examples/ray_tune.py --trials 8 --states 4096
     python examples/ray_tune.py --address auto --out /shared/tune --trials 200
 
-A trial is the default preset of baselines/meta_dqn.py with six settings of its own; the first has
-the preset's. It reports after each of its 20 training problems how well it acts, greedily, on
-problems held out for tuning. The scheduler ASHA compares trials at problems 5, 10 and 20, and stops
-the worse half. All trials learn from the same number of states an episode, so that more updates
-mean smaller batches, and a longer training is not mistaken for a better setting.
+A trial is the default preset of baselines/meta_dqn.py with six settings changed; the first trial
+has the preset's own. After each of its 20 training problems it reports how well it acts, greedily,
+on problems held out for tuning. The ASHA scheduler compares trials at problems 5, 10 and 20, and
+stops the worse half. All trials learn from the same number of states per episode, so that more
+updates mean smaller batches, and longer training is not mistaken for a better setting.
 
-The best trial and the first are then played on other problems, those of a training's own final
-table, which nothing was chosen by.
+The best trial and the first are then evaluated on other problems, those of a run's own final table,
+which played no part in the selection.
 
-Output: a table of the trials, and the command that trains with the best settings; all else is in
-OUT, which on a cluster has to be a folder that all machines see under the same path, and this
-checkout too. A trial whose worker is lost starts again from its first episode.
+Output: a table of the trials, and the command that trains with the best settings; everything else
+is in OUT, which on a cluster must be a folder that all machines see under the same path, as must
+this checkout. A trial whose worker is lost starts again from its first episode.
 """
 
 import os
@@ -39,12 +39,11 @@ from ray.tune.search.basic_variant import BasicVariantGenerator
 from ray_seeds import start_ray
 
 from baselines.learning.config import preset_options
-from baselines.learning.experiment import training_problems
-from baselines.learning.training import Streams, Training
+from baselines.learning.training import Streams, Training, training_problems
 from baselines.meta_dqn import Args as Options
 from baselines.meta_dqn import MetaLearner
 from baselines.policies.evaluation import Evaluation, evaluate, find_optima, unseen_problems
-from baselines.policies.policy import NetworkPolicy, load_policy, save_policy
+from baselines.policies.policy import load_policy, save_policy
 from baselines.policies.settings import Setting
 from baselines.runs.folder import WEIGHTS_FILE
 from mapp_env.grids import find_grid
@@ -62,19 +61,19 @@ class Args:
     """Options of a search."""
 
     out: Path = Path("runs/tune")
-    """folder for what Ray Tune keeps"""
+    """folder for Ray Tune's files"""
     trials: int = 8
-    """settings to try; the first are the preset's own"""
+    """number of settings to try; the first are the preset's own"""
     states: int = 16_384
     """states learned from after each episode: updates times batch size; the preset's are 16,384"""
     problems: int = 500
     """problems held out for tuning"""
     jobs: int = 2
-    """trials at a time; on a cluster as well"""
+    """trials at a time, also on a cluster"""
     seed: int = 0
-    """seed of the settings that are tried, and of every training"""
+    """seed of the settings tried, and of every run"""
     address: str | None = None
-    """of a Ray cluster ("auto": the one this machine belongs to); by default Ray is started here"""
+    """Ray cluster to use ("auto": the one this machine belongs to); by default Ray starts here"""
 
     def __post_init__(self) -> None:
         check_count("trials", self.trials, 1, 100_000)
@@ -83,11 +82,11 @@ class Args:
         check_count("jobs", self.jobs, 1, 1024)
 
 
-# -- what is searched --------------------------------------------------------------------------
+# -- search space ------------------------------------------------------------------------------
 
 
 def search_space(states: int) -> dict[str, Any]:
-    """Return where the settings are drawn from."""
+    """Return the search space."""
     return {
         "learning_rate": tune.loguniform(0.002, 0.02),
         "hidden_units": tune.choice([128, 256, 384]),
@@ -101,9 +100,7 @@ def search_space(states: int) -> dict[str, Any]:
 def make_options(config: dict[str, Any], states: int, seed: int) -> Options:
     """Return the preset's options with a trial's settings."""
     batch_size = states // config["updates_per_episode"]
-    return preset_options(
-        Options, "default", seed=seed, prefetch=False, batch_size=batch_size, **config
-    )
+    return preset_options(Options, "default", seed=seed, batch_size=batch_size, **config)
 
 
 def preset_point(space: dict[str, Any], states: int) -> dict[str, Any]:
@@ -117,16 +114,16 @@ def preset_point(space: dict[str, Any], states: int) -> dict[str, Any]:
 
 
 def held_out(setting: Setting, n_problems: int, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return problems to tune on and those of the final table: none in both, none trained on."""
+    """Return problems for tuning and for the final table: disjoint, and none trained on."""
     final = unseen_problems(setting, 1000, seen.tolist())
     tuning = unseen_problems(setting, n_problems, [*seen.tolist(), *final.tolist()], TUNING_SEED)
     return tuning, final
 
 
 def excess(evaluation: Evaluation) -> float:
-    """Return by how many per cent the optimum is exceeded, the step limit counted where unsolved.
+    """Return the mean excess over the optimum in percent, counting unsolved as the step limit.
 
-    Unlike the gap it does not get smaller by leaving hard problems unsolved.
+    Unlike the gap, it does not shrink when hard problems are left unsolved.
     """
     assert evaluation.optima is not None
     return 100.0 * float((evaluation.steps / evaluation.optima.cover_time - 1.0).mean())
@@ -154,7 +151,7 @@ def run_trial(config: dict[str, Any], states: int, n_problems: int, seed: int) -
             "CPU seconds": time.process_time(),
         }
         with tempfile.TemporaryDirectory() as folder:
-            save_policy(Path(folder) / WEIGHTS_FILE, learner.policy().network)
+            save_policy(Path(folder) / WEIGHTS_FILE, learner.policy().network, grid)
             tune.report(metrics, checkpoint=tune.Checkpoint.from_directory(folder))
 
 
@@ -195,12 +192,12 @@ def search(args: Args) -> "tune.ResultGrid":
 
 
 def print_trials(results: "tune.ResultGrid") -> None:
-    """Print a Markdown table, a row for each trial, the best first.
+    """Print a Markdown table with one row per trial, the best first.
 
     Raises
     ------
     ValueError
-        If all have failed.
+        If all trials have failed.
     """
     ended = [result for result in results if result.error is None]
     for error in results.errors:
@@ -220,20 +217,19 @@ def print_trials(results: "tune.ResultGrid") -> None:
 
 
 def final_figures(args: Args, result: "tune.Result") -> str:
-    """Play the final problems with what a trial has learned; return what came out."""
+    """Evaluate a trial's network on the final problems; return the figures."""
     options = make_options(result.config, args.states, args.seed)
     grid = find_grid(options.grid)
     setting = Setting(grid, options.n_agents, options.n_landmarks, options.max_cycles)
     _, final = held_out(setting, args.problems, training_problems(options, grid))
     with result.checkpoint.as_directory() as folder:
-        network = load_policy(Path(folder) / WEIGHTS_FILE).network
-    policy = NetworkPolicy(network, grid)  # a trial keeps weights alone, not which grid they are of
+        policy = load_policy(Path(folder) / WEIGHTS_FILE)
     found = evaluate(policy, setting, final, find_optima(setting, final)).summary()
     return ", ".join(f"{name} {found[name]:.2f}" for name in ("solved %", "gap %", "optimal %"))
 
 
 def main(args: Args) -> None:
-    """Search, and print what was found."""
+    """Search, and print the results."""
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
     start_ray(args.address, args.jobs, MAX_RETRIES)

@@ -1,6 +1,6 @@
-"""Train PPO with RLlib's new API stack, one policy for all agents or one for each, for a minute.
+"""Train PPO with RLlib's new API stack for a minute, with one policy for all agents or one each.
 
-RLlib pins a Gymnasium of its own and is large (1.9 GB): give it a virtual environment of its own.
+RLlib pins its own Gymnasium version and is large (1.9 GB): use a separate virtual environment.
 
     python3 -m venv .venv-rllib
     grep -v '^gymnasium==' constraints.txt > /tmp/rllib-constraints.txt
@@ -8,11 +8,11 @@ RLlib pins a Gymnasium of its own and is large (1.9 GB): give it a virtual envir
     .venv-rllib/bin/python examples/rllib_ppo.py --policies shared
     .venv-rllib/bin/python examples/rllib_ppo.py --policies independent
 
-The observation "geodesic" is read as a set: a network for one landmark, summed over those that are
-unvisited, then one for the sum (RLlib's own layers learn much more slowly here). Prints the mean
-return of an episode while training, then plays problems that were not met in training, greedily:
-share solved, and how far above the proven optimum the cover time is. One core: sampling and
-learning take turns in this process.
+The observation "geodesic" is treated as a set: a network applied to each landmark, summed over the
+unvisited ones, then a second network for the sum (RLlib's own layers learn much more slowly here).
+Prints the mean episode return during training, then plays unseen problems greedily: share solved,
+and how far the cover time is above the proven optimum. One core: sampling and learning alternate
+in this process.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ TASK = {"n_agents": N_AGENTS, "observation": "geodesic", "reward": "geodesic"}
 
 
 class Training(BaseParallelWrapper[str, np.ndarray, int]):
-    """Rewards of the order of one, as a value network likes them; remembers the problems it met."""
+    """Scales rewards to the order of one, for the value network; records the problems met."""
 
     met: ClassVar[set[tuple[int, ...]]] = set()
 
     def reset(self, seed=None, options=None):  # noqa: D102
         returned = self.env.reset(seed=seed, options=options)
-        cells = self.env.state()[N_AGENTS:].astype(int)  # of the landmarks, then what is visited
+        cells = self.env.state()[N_AGENTS:].astype(int)  # landmark cells, then visited flags
         self.met.add(tuple(cells[: len(cells) // 2].tolist()))
         return returned
 
@@ -66,7 +66,7 @@ class Training(BaseParallelWrapper[str, np.ndarray, int]):
 
 
 class LandmarkSet(TorchRLModule, ValueFunctionAPI):
-    """Logits of an agent's actions, and its value, from what it sees of each landmark."""
+    """Logits of an agent's actions, and its value, from its features of each landmark."""
 
     def setup(self) -> None:  # noqa: D102
         n_features = self.observation_space.shape[0] // self.model_config["n_landmarks"]
@@ -74,7 +74,7 @@ class LandmarkSet(TorchRLModule, ValueFunctionAPI):
         self.value = self.network(n_features, 1)
 
     def network(self, n_features: int, n_outputs: int) -> nn.ModuleDict:
-        """Return a network for one landmark, and one for the sum over the unvisited ones."""
+        """Return a network for each landmark, and one for the sum over the unvisited ones."""
         n = self.model_config["n_units"]
         one = nn.Sequential(nn.Linear(n_features, n), nn.ReLU(), nn.Linear(n, n), nn.ReLU())
         return nn.ModuleDict(
@@ -96,12 +96,12 @@ class LandmarkSet(TorchRLModule, ValueFunctionAPI):
 
 
 def name_policy(policies: str, agent: str) -> str:
-    """Return which policy commands an agent."""
+    """Return the name of the policy that commands an agent."""
     return "shared" if policies == "shared" else agent
 
 
 def configure(policies: str, seed: int) -> PPOConfig:
-    """Return the settings of a training: which agent is commanded by which policy, and PPO's."""
+    """Return the training config: the mapping of agents to policies, and PPO's settings."""
     register_env("mapp", lambda _: ParallelPettingZooEnv(Training(mapp_v0.parallel_env(**TASK))))
     names = {name_policy(policies, f"agent_{index}") for index in range(N_AGENTS)}
     network = {"n_landmarks": mapp_v0.parallel_env(**TASK).task.n_landmarks, "n_units": N_UNITS}
@@ -141,11 +141,11 @@ def configure(policies: str, seed: int) -> PPOConfig:
 
 
 def train(algorithm: Algorithm, seconds: float) -> tuple[float, float]:
-    """Train for some seconds; return the mean return at the beginning and at the end."""
+    """Train for some seconds; return the mean return at the start and at the end."""
     returns, steps, started = [], 0, time.process_time()
     while (spent := time.process_time() - started) < seconds:
         found = algorithm.train()["env_runners"]
-        # Every agent gets the team's reward: the sum over agents counts it three times.
+        # Every agent receives the team's reward, so the sum over agents counts it three times.
         returns.append(found["episode_return_mean"] / N_AGENTS / REWARD_SCALE)
         steps = found["num_env_steps_sampled_lifetime"]
         print(f"{spent:5.0f} s {steps:8,.0f} steps: return {returns[-1]:7.2f}", flush=True)
@@ -153,7 +153,7 @@ def train(algorithm: Algorithm, seconds: float) -> tuple[float, float]:
 
 
 def greedy(algorithm: Algorithm, policies: str) -> Acting:
-    """Return what acts on the policies' most probable actions."""
+    """Return a function that takes the policies' most probable actions."""
     modules = [algorithm.get_module(name_policy(policies, f"agent_{i}")) for i in range(N_AGENTS)]
 
     def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:

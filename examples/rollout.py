@@ -1,4 +1,4 @@
-"""Play one episode with a simple rule and keep it as an animated picture.
+"""Play one episode with a simple rule and save it as an animated GIF.
 
 python examples/rollout.py --out rollout.gif
 """
@@ -15,7 +15,7 @@ from mapp_env.rendering import save_gif
 
 
 def spread_out(grid: mapp_env.Grid, state: np.ndarray, n_agents: int) -> list[int]:
-    """Send each agent a step towards its nearest landmark that no agent before it has taken."""
+    """Move each agent a step towards the nearest landmark not taken by an earlier agent."""
     n_landmarks = (len(state) - n_agents) // 2
     cells = state[:n_agents].astype(int)
     landmarks = state[n_agents : n_agents + n_landmarks].astype(int)

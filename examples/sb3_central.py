@@ -1,7 +1,7 @@
 """Stable-Baselines3 on `mapp_env/Central-v0`: DQN over the 64 joint actions of three agents.
 
-One network sees each agent's shortest paths to the landmarks (`observation="geodesic"`) and values
-every joint action. What it reached is in docs/trainers.md.
+One network sees each agent's shortest paths to the landmarks (`observation="geodesic"`) and gives
+a Q-value for every joint action. Results are in docs/trainers.md.
 
     python examples/sb3_central.py            # a minute of CPU time; --help for more
 
@@ -29,21 +29,21 @@ class Args:
     seconds: float = 60.0
     """CPU seconds to train for"""
     steps: int = 120_000
-    """most steps to train for; exploration falls over them"""
+    """maximum steps to train for; exploration decreases over them"""
     problems: int = 1000
     """number of problems to evaluate on, greedily"""
     seed: int = 0
     """seed of network, exploration and problems"""
     num_envs: int = 16
-    """environments that are played side by side"""
+    """number of parallel environments"""
     learning_rate: float = 1e-3
-    """of Adam"""
+    """learning rate of Adam"""
     discount: float = 0.9
-    """of a step"""
+    """discount per step"""
 
 
 def main(args: Args) -> None:
-    """Train and print what was reached."""
+    """Train and print the results."""
     check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     envs = make_vec_env(
@@ -75,7 +75,7 @@ def main(args: Args) -> None:
 
     def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         numbers = model.predict(observations, deterministic=True)[0]
-        return np.stack(np.unravel_index(numbers, (4, 4, 4)), axis=1)  # the first agent leads
+        return np.stack(np.unravel_index(numbers, (4, 4, 4)), axis=1)  # first agent first
 
     report(watch.elapsed, watch.returns, act, args.problems, observation="geodesic")
 

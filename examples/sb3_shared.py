@@ -1,8 +1,9 @@
-"""SuperSuit and Stable-Baselines3: PPO, one network that every agent uses by itself.
+"""SuperSuit and Stable-Baselines3: PPO with one network that all agents use separately.
 
-`make_sb3_shared` puts the view of `mapp_env.adapters.sb3_shared` over SuperSuit's batch of agents,
-so that seeds and time-outs arrive. Agents start on one cell: `observation="geodesic"` tells each
-for which landmarks it is the nearest. What it reached is in docs/trainers.md.
+`make_sb3_shared` puts the wrapper in `mapp_env.adapters.sb3_shared` around SuperSuit's batch of
+agents, so that seeds and truncations get through. Agents start on the same cell;
+`observation="geodesic"` tells each which landmarks it is the nearest to. Results are in
+docs/trainers.md.
 
     python examples/sb3_shared.py             # a minute of CPU time; --help for more
 
@@ -35,21 +36,21 @@ class Args:
     seed: int = 0
     """seed of network, exploration and problems"""
     num_envs: int = 16
-    """environments; the network commands three rows of each"""
+    """number of environments; each has three rows, one per agent"""
     learning_rate: float = 1e-3
-    """of Adam"""
+    """learning rate of Adam"""
     discount: float = 0.95
-    """of a step"""
+    """discount per step"""
 
 
 def main(args: Args) -> None:
-    """Train and print what was reached."""
+    """Train and print the results."""
     check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     envs = make_sb3_shared(args.num_envs, observation="geodesic")
     model = PPO(
         "MlpPolicy",
-        # Returns run into the hundreds: scaled, or the critic's loss drowns the actor's.
+        # Returns run into the hundreds: unscaled, the critic's loss would drown the actor's.
         VecNormalize(VecMonitor(envs), norm_obs=False, gamma=args.discount),
         n_steps=64,
         batch_size=768,
@@ -69,7 +70,7 @@ def main(args: Args) -> None:
         rows = observations.reshape(-1, observations.shape[-1])
         return model.predict(rows, deterministic=True)[0].reshape(observations.shape[:2])
 
-    # The agents of a team end together, with the same return.
+    # All agents of a team finish together, with the same return.
     returns = watch.returns[:: envs.n_agents]
     report(watch.elapsed, returns, act, args.problems, observation="geodesic")
 

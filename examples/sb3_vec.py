@@ -1,8 +1,8 @@
-"""Stable-Baselines3 on the batched engine: PPO, one network that commands all agents.
+"""Stable-Baselines3 on the batched engine: PPO with one network that commands all agents.
 
-`make_sb3_vec` is `mapp_env.make_vec` as a VecEnv: no environment a row. The
-network sees each agent's shortest paths to the landmarks (`observation="geodesic"`) and gives an
-action for each agent. What it reached is in docs/trainers.md.
+`make_sb3_vec` is `mapp_env.make_vec` as a VecEnv, without a separate environment per row. The
+network sees each agent's shortest paths to the landmarks (`observation="geodesic"`) and outputs an
+action for each agent. Results are in docs/trainers.md.
 
     python examples/sb3_vec.py                # a minute of CPU time; --help for more
 
@@ -37,19 +37,19 @@ class Args:
     num_envs: int = 128
     """rows of the engine"""
     learning_rate: float = 1e-3
-    """of Adam"""
+    """learning rate of Adam"""
     discount: float = 0.95
-    """of a step"""
+    """discount per step"""
 
 
 def main(args: Args) -> None:
-    """Train and print what was reached."""
+    """Train and print the results."""
     check_options(args.seconds, args.problems)
     torch.set_num_threads(1)
     envs = make_sb3_vec(args.num_envs, observation="geodesic")
     model = PPO(
         "MlpPolicy",
-        # Returns run into the hundreds: scaled, or the critic's loss drowns the actor's.
+        # Returns run into the hundreds: unscaled, the critic's loss would drown the actor's.
         VecNormalize(envs, norm_obs=False, gamma=args.discount),
         n_steps=16,
         batch_size=512,

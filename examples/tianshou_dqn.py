@@ -1,13 +1,13 @@
-"""Tianshou 2: three independent double DQNs on the AEC form, each agent its own network.
+"""Tianshou 2: independent double DQN on the AEC environment, one network per agent.
 
-Tianshou takes PettingZoo's AEC form, `mapp_v0.env()`, in which agents act in turns, and stores
-their turns one after the other. So an agent's next turn is three turns on: with a three-step return
-each agent learns from what it saw itself. What it reached is in docs/trainers.md.
+Tianshou takes PettingZoo's AEC environment, `mapp_v0.env()`, in which agents act in turns, and
+stores their turns one after the other. An agent's next turn is thus three turns later: with a
+three-step return each agent learns from its own observations. Results are in docs/trainers.md.
 
     python examples/tianshou_dqn.py                # a minute of CPU time; --help for more
 
-Needs Tianshou 2. It wants older versions of filelock and pandas than the pinned ones, so it gets an
-environment of its own (in bash):
+Needs Tianshou 2. It requires older versions of filelock and pandas than the pinned ones, so install
+it in a separate virtual environment (in bash):
 
     python3 -m venv .venv-tianshou
     .venv-tianshou/bin/pip install -c <(grep -vE '^(filelock|pandas)=' constraints.txt) \
@@ -48,22 +48,22 @@ class Args:
     seed: int = 0
     """seed of networks, exploration and problems"""
     num_envs: int = 64
-    """environments that are played side by side"""
+    """number of parallel environments"""
     learning_rate: float = 1e-3
-    """of Adam"""
+    """learning rate of Adam"""
     reward_scale: float = 0.05
-    """what rewards are multiplied with: a step's may be -30"""
+    """factor for rewards, which may be -30 in one step"""
     discount: float = 0.9
-    """of a step of the team"""
+    """discount per step of the team"""
 
 
 class ScaledEnv(PettingZooEnv):
-    """Tianshou's view of the environment, with smaller rewards."""
+    """Tianshou's wrapper of the environment, with scaled rewards."""
 
     scale = 1.0
 
     def step(self, action: int) -> tuple[dict, list[float], bool, bool, dict]:
-        """Take an agent's turn; return what the next one sees, and everyone's reward."""
+        """Take an agent's turn; return the next agent's observation, and everyone's reward."""
         observation, rewards, terminated, truncated, info = super().step(action)
         return observation, [self.scale * r for r in rewards], terminated, truncated, info
 
@@ -84,7 +84,7 @@ def make_learner(env: PettingZooEnv, args: Args) -> DQN:
     return DQN(
         policy=policy,
         optim=AdamOptimizerFactory(lr=args.learning_rate),
-        gamma=args.discount ** (1 / n_agents),  # of one agent's turn
+        gamma=args.discount ** (1 / n_agents),  # per turn of one agent
         n_step_return_horizon=n_agents,
         target_update_freq=200,
         huber_loss_delta=1.0,
@@ -92,9 +92,9 @@ def make_learner(env: PettingZooEnv, args: Args) -> DQN:
 
 
 def main(args: Args) -> None:
-    """Train and print what was reached."""
+    """Train and print the results."""
     check_options(args.seconds, args.problems)
-    # It says at each step that it flattens returns of several agents for its statistics.
+    # Otherwise it warns at each step that it flattens multi-agent returns for its statistics.
     logging.getLogger("tianshou").setLevel(logging.ERROR)
     torch.set_num_threads(1)
     np.random.seed(args.seed)  # noqa: NPY002 - Tianshou explores with it
@@ -122,7 +122,7 @@ def main(args: Args) -> None:
         VectorReplayBuffer(60_000, args.num_envs),
         exploration_noise=True,
         on_episode_done_hook=keep_return,
-        raise_on_nan_in_buffer=False,  # it would look through the whole buffer at each step
+        raise_on_nan_in_buffer=False,  # it would scan the whole buffer at each step
     )
     trainer = OffPolicyTrainer(
         algorithm,
@@ -130,7 +130,7 @@ def main(args: Args) -> None:
             training_collector=collector,
             max_epochs=1_000_000,
             epoch_num_steps=48 * args.num_envs,
-            # So fewer than 20 gradient steps follow: from 20 on a progress bar cannot be put off.
+            # Keeps gradient steps below 20: from 20 on the progress bar cannot be disabled.
             collection_step_num_env_steps=24 * args.num_envs,
             update_step_num_gradient_steps_per_sample=1 / 80,
             batch_size=384,
@@ -143,7 +143,7 @@ def main(args: Args) -> None:
     trainer.reset()
     while (elapsed := time.process_time() - started) < args.seconds:
         for learner in learners:
-            # Of several agents Tianshou knows that it trains, of each single one it does not.
+            # Tianshou marks only the joint policy as training, not the individual ones.
             learner.policy.set_eps_inference(max(0.05, 1.0 - 2.0 * elapsed / args.seconds))
         trainer.execute_epoch()
 

@@ -1,4 +1,4 @@
-"""TorchRL: value decomposition (VDN) on ``mapp_env``, learned in about a minute on one core.
+"""TorchRL: value decomposition (VDN) on ``mapp_env``, trained in about a minute on one core.
 
 Usage::
 
@@ -6,12 +6,12 @@ Usage::
     OMP_NUM_THREADS=1 python examples/torchrl_vdn.py
     python examples/torchrl_vdn.py --help
 
-One network, shared by the agents, gives each agent values of its actions from its own view; their
-sum is taught to be the value of the team (centralised training, decentralised execution). All parts
-are TorchRL's: wrapper, collector, replay buffer, loss, mixer, target network.
+One network, shared by the agents, computes each agent's action values from its own observation;
+their sum is trained to be the value of the team (centralised training, decentralised execution).
+All parts are TorchRL's: wrapper, collector, replay buffer, loss, mixer, target network.
 
-Output: the mean return of the training episodes every thousand steps; then the greedy policy before
-and after on unseen problems, beside their proven optimum.
+Output: the mean return of the training episodes every thousand steps; then the greedy policy on
+unseen problems before and after training, compared with the proven optima.
 """
 
 from __future__ import annotations
@@ -55,36 +55,36 @@ class Args:
     updates_per_batch: int = 30
     """updates after that"""
     batch_size: int = 128
-    """transitions an update learns from"""
+    """transitions per update"""
     reward: Literal["manhattan", "geodesic", "step"] = "geodesic"
     """the team reward"""
     reward_scale: float = 0.05
-    """what rewards are multiplied by, to keep values of the order of one"""
+    """factor for rewards, to keep values of the order of one"""
     discount: float = 0.9
     """discount factor of future rewards"""
     learning_rate: float = 0.001
-    """step size of Adam"""
+    """learning rate of Adam"""
     tau: float = 0.01
-    """share of the way that the target network goes to the network at each update"""
+    """fraction by which the target network moves towards the network at each update"""
     hidden_units: int = 64
     """rectifier units in a hidden layer"""
     explore: float = 0.1
-    """share of random actions when half of the steps are played; it falls to this from 1"""
+    """final share of random actions; decreases from 1 during the first half of the steps"""
     problems: int = 500
-    """unseen problems to judge the policy on"""
+    """unseen problems to evaluate on"""
 
 
 def make_env(args: Args) -> PettingZooWrapper:
-    """Return the environment as TorchRL has it: one group, "agent", of all agents."""
+    """Return the environment in TorchRL's wrapper: one group, "agent", of all agents."""
     env = mapp_v0.parallel_env(observation="geodesic", reward=args.reward)
     with warnings.catch_warnings():
-        # It names the one PettingZoo version of 2024 that TorchRL tests with.
+        # TorchRL warns that it tests with one PettingZoo version, from 2024.
         warnings.filterwarnings("ignore", "PettingZoo in TorchRL is tested", UserWarning)
         return PettingZooWrapper(env, categorical_actions=True, return_state=True)
 
 
 class LandmarkSet(nn.Module):
-    """Values of an agent's actions, from what it sees of each landmark, in whatever order."""
+    """An agent's action values, from its features of each landmark, in any order."""
 
     def __init__(self, n_features: int, n_actions: int, n_units: int) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ def make_actor(env: PettingZooWrapper, args: Args) -> QValueActor:
 
 
 def make_loss(actor: QValueActor, env: PettingZooWrapper, args: Args) -> QMixerLoss:
-    """Return the loss of the summed values; VDN is QMIX with a sum as its mixer."""
+    """Return the VDN loss: QMIX with a sum as its mixer."""
     mixer = VDNMixer(n_agents=len(env.group_map["agent"]), device="cpu")
     loss = QMixerLoss(
         actor,
@@ -133,11 +133,11 @@ def make_loss(actor: QValueActor, env: PettingZooWrapper, args: Args) -> QMixerL
 
 
 def for_replay(played: TensorDictBase, env: PettingZooWrapper, args: Args) -> TensorDictBase:
-    """Return transitions as the loss needs them, from what the collector played.
+    """Convert the collector's transitions to what the loss needs.
 
-    The reward is the team's, once and not for each agent. On an episode's last step the wrapper
-    opens all action masks; as the value of a truncated episode's last state is learned from, they
-    are made again from the agents' cells, with which the state begins.
+    The reward is the team's, once rather than per agent. On an episode's last step the wrapper
+    opens all action masks; since the loss bootstraps from the last state of a truncated episode,
+    the masks are restored from the agents' cells, with which the state begins.
     """
     following = played["next"]
     n_agents = following[MASK].shape[-2]
@@ -151,14 +151,14 @@ def for_replay(played: TensorDictBase, env: PettingZooWrapper, args: Args) -> Te
 
 
 class Returns:
-    """Sums rewards, step by step, up to the returns of episodes."""
+    """Accumulates rewards into episode returns."""
 
     def __init__(self) -> None:
         self.total = 0.0  # of the episode in progress
         self.ended: list[float] = []
 
     def add(self, played: TensorDictBase) -> None:
-        """Add steps that follow those before."""
+        """Add the next steps."""
         rewards = played["next", "agent", "reward"][:, 0, 0].tolist()
         for reward, done in zip(rewards, played["next", "done"][:, 0].tolist(), strict=True):
             self.total += reward
@@ -168,7 +168,7 @@ class Returns:
 
 
 def judge_actor(actor: QValueActor, landmarks: np.ndarray, args: Args) -> Judgement:
-    """Let the agents act greedily on problems."""
+    """Evaluate the greedy policy."""
 
     def act(observations: np.ndarray, masks: np.ndarray) -> np.ndarray:
         views = TensorDict(
@@ -182,7 +182,7 @@ def judge_actor(actor: QValueActor, landmarks: np.ndarray, args: Args) -> Judgem
 
 
 def train(env: PettingZooWrapper, actor: QValueActor, args: Args) -> TensorDictReplayBuffer:
-    """Teach the actor; return all transitions that were played."""
+    """Train the actor; return all transitions collected."""
     loss = make_loss(actor, env, args)
     targets = SoftUpdate(loss, tau=args.tau)
     optimiser = torch.optim.Adam(loss.parameters(), lr=args.learning_rate)
@@ -199,7 +199,7 @@ def train(env: PettingZooWrapper, actor: QValueActor, args: Args) -> TensorDictR
         TensorDictSequential(actor, explorer),
         frames_per_batch=args.steps_per_batch,
         total_frames=args.steps,
-        auto_register_policy_transforms=False,  # nothing here asks for any
+        auto_register_policy_transforms=False,  # none needed
     )
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(args.steps + args.steps_per_batch), batch_size=args.batch_size
@@ -228,7 +228,7 @@ def train(env: PettingZooWrapper, actor: QValueActor, args: Args) -> TensorDictR
 
 
 def main(args: Args) -> None:
-    """Train, and judge before and after."""
+    """Train, and evaluate before and after."""
     torch.manual_seed(args.seed)
     env = make_env(args)
     check_env_specs(env)

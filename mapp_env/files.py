@@ -112,7 +112,7 @@ def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = 
     try:
         return json.loads(
             data if isinstance(data, str) else data.decode("utf-8"),
-            object_pairs_hook=unique_fields,
+            object_pairs_hook=_unique_fields,
             parse_constant=_finite,
             parse_float=_finite,
         )
@@ -122,7 +122,7 @@ def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = 
         raise error_type(f"{where}: is not strict JSON: {error}") from error
 
 
-def unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object of JSON, but refuse one with a key twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):

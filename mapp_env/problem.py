@@ -270,12 +270,12 @@ def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[
         # Uniform in 0..last: of the 2**32 values of `bits`, those past the last full multiple of
         # the range are drawn again.
         span = last + 1
-        limit = (LOW_32_BITS + 1) // span * span
-        bits = limit
-        while bits >= limit:
+        pick, multiple = 0, LOW_32_BITS
+        while multiple > LOW_32_BITS + 1 - span:
             bits = scramble(scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
             used += 1
-        pick = bits % span
+            pick = bits % span
+            multiple = bits - pick
         for earlier in range(chosen):
             if out[earlier] == pick:
                 pick = last

@@ -1,7 +1,7 @@
-"""What every joint action of a state costs: the exact solver's answers, for teaching.
+"""What every joint action costs in a state: the exact solver's answers, as labels.
 
-From any cells of the agents and any unvisited landmarks, the least number of steps until all are
-visited after each joint action, by the same reasoning as ``mapp_env.solve(..., "cover_time")``:
+From any cells of the agents and any unvisited landmarks: the least number of steps until all are
+visited, after each joint action, by the reasoning of ``mapp_env.solve(..., "cover_time")``:
 shortest routes through every set of landmarks (Held and Karp 1962), then the best partition of the
 landmarks among the agents.
 """

@@ -3,6 +3,8 @@
 import numpy as np
 import torch
 
+from baselines.runs.checkpoints import take
+
 
 def optimiser_arrays(optimiser: torch.optim.Optimizer) -> dict[str, np.ndarray]:
     """Return what an optimiser remembers of each weight: none before its first step."""
@@ -22,27 +24,19 @@ def restore_optimiser(
     Raises
     ------
     ValueError
-        If it is not there of each weight, and of no other, or after another number of steps.
+        If it is not there of each weight, or after another number of steps.
     """
+    content = optimiser.state_dict()
+    content["state"] = {}
     weights = [weight for group in optimiser.param_groups for weight in group["params"]]
-    wanted = {}
     for index, weight in enumerate(weights):
         if not steps or not weight.requires_grad:
             continue
-        shapes = {"step": (), "exp_avg": tuple(weight.shape), "exp_avg_sq": tuple(weight.shape)}
-        wanted |= {f"{index}.{name}": shape for name, shape in shapes.items()}
-    found = {name: array.shape for name, array in arrays.items()}
-    for name in sorted(wanted.keys() | found.keys()):
-        if wanted.get(name) != found.get(name):
-            raise ValueError(
-                f"optimiser.{name} must have the shape {wanted.get(name)}, got {found.get(name)}"
-            )
-        # A count in 32 bits ends there.
-        if name.endswith(".step") and arrays[name] != min(steps, 2**24):
-            raise ValueError(f"optimiser.{name} must be {steps}, got {arrays[name]}")
-    content = optimiser.state_dict()
-    content["state"] = {}
-    for key, array in arrays.items():
-        index, name = key.split(".")
-        content["state"].setdefault(int(index), {})[name] = torch.from_numpy(array.copy())
+        step = take(arrays, f"{index}.step", np.array(steps, np.float32))
+        if step != min(steps, 2**24):  # a count in 32 bits ends there
+            raise ValueError(f"optimiser.{index}.step must be {steps}, got {step}")
+        memory = {"step": step}
+        for name in ("exp_avg", "exp_avg_sq"):
+            memory[name] = take(arrays, f"{index}.{name}", weight.detach().numpy())
+        content["state"][index] = {k: torch.from_numpy(array) for k, array in memory.items()}
     optimiser.load_state_dict(content)

@@ -1,321 +1,319 @@
-"""Studies: the same training with several seeds and options, and what came out of all of them.
+"""Studies: the same training with several seeds and options.
 
-Trains what is missing, as many at a time as there are cores, each in a process with one thread;
-goes on where it was stopped; adds up over the seeds. ``compare.py`` and ``ablate.py`` are studies.
+Trains what is missing, as many at a time as there are cores, each in a process with one thread, and
+goes on where it was stopped; then adds up over the seeds. ``compare.py`` and ``ablate.py`` are
+studies.
 """
 
-import csv
-import io
-import math
+import dataclasses
 import os
 import subprocess
+import sys
 import time
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from types import ModuleType
+from typing import Annotated, NamedTuple
 
-import numpy as np
-from scipy import stats
+from filelock import FileLock, Timeout
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.learning.trials import EVALUATION_FILE, Trial
-from baselines.runs.folder import (
-    METRICS_FILE,
-    TIMING_FILE,
-    StopSignals,
-    parse_json,
-    read_metrics,
+from baselines.learning.config import Options, option_name, parse_options
+from baselines.learning.ranges import Within, check_options
+from baselines.learning.summary import (
+    Outcome,
+    Summary,
+    format_study,
+    read_outcome,
+    save_study,
+    summarise,
 )
-from mapp_env.files import read_bytes, write_text
+from baselines.runs.folder import (
+    CONFIG_FILE,
+    EVALUATION_FILE,
+    LOCK_FILE,
+    METRICS_FILE,
+    foreign_entry,
+    read_config,
+)
+from baselines.runs.stop import StopSignals
 
-MAX_TABLE_BYTES = 1 << 20
-ROW = "network alone"
-RETURN_EPISODES = 100  # the last ones of a training, for its return
-N_RESAMPLES = 10_000
-CONFIDENCE = 0.95
-CUT = 0.25  # from each side: the interquartile mean
+# What a study sets for each run itself.
+OWN_OPTIONS = ("out", "resume", "seed", "preset", "share_parameters", "threads")
 
 
-# -- trainings ---------------------------------------------------------------------------------
+# -- one run -----------------------------------------------------------------------------------
 
 
-def train_all(trials: Iterable[Trial], jobs: int, signals: StopSignals) -> list[str]:
-    """Run what is not finished, `jobs` at a time; return what went wrong, a line for each."""
-    trials = list(trials)
-    waiting = deque(t for t in trials if not t.finished)
-    running: dict[subprocess.Popen[bytes], Trial] = {}
+class Run(NamedTuple):
+    """One training of a study."""
+
+    group: tuple[str, ...]  # what is summed up over the seeds: its row's first cells in the table
+    seed: int
+    folder: Path
+    algorithm: str
+    options: Options
+    words: tuple[str, ...]  # its options, as words of a command line
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages."""
+        return self.folder.name
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has been evaluated, the last thing that counts here."""
+        return (self.folder / EVALUATION_FILE).is_file()
+
+    @property
+    def arguments(self) -> list[str]:
+        """Words of the command line that start it, or go on with it."""
+        if (self.folder / CONFIG_FILE).exists():
+            return ["--resume", str(self.folder)]
+        return [*self.words, "--out", str(self.folder)]
+
+    @property
+    def log(self) -> Path:
+        """Where its output goes."""
+        return self.folder.with_name(self.folder.name + ".log")
+
+    def last_words(self) -> str:
+        """Return the last line of its log that says something."""
+        lines = self.log.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "ended without a word"
+
+    def count_episodes(self) -> int:
+        """Return how many episodes are in its metrics.csv so far."""
+        try:
+            return max((self.folder / METRICS_FILE).read_bytes().count(b"\n") - 1, 0)
+        except OSError:
+            return 0
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Start it in a process of its own, or go on with it."""
+        root = str(Path(__file__).resolve().parents[2])
+        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+        with self.log.open("ab") as log:
+            return subprocess.Popen(
+                # -P: what lies in the working folder is none of its modules.
+                [sys.executable, "-P", "-m", f"baselines.{self.algorithm}", *self.arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                # Ctrl-C is for this process, which passes one signal on: a second would cut a
+                # checkpoint short.
+                start_new_session=True,
+            )
+
+    def outcome(self) -> Outcome:
+        """Read what came out of it, once it is finished."""
+        return read_outcome(self.group, self.folder, self.options.max_cycles)
+
+    def check_folder(self) -> None:
+        """Refuse what was trained with other options, and what is no training.
+
+        Raises
+        ------
+        ValueError
+            If its folder holds anything else.
+        """
+        folder = self.folder
+        if not folder.is_dir():
+            return
+        if (folder / CONFIG_FILE).exists():
+            config = read_config(folder)
+            options = config.get("options")
+            wanted = {**dataclasses.asdict(self.options), "out": None, "resume": None}
+            found = {**options, "out": None, "resume": None} if isinstance(options, dict) else {}
+            differing = sorted(
+                name for name in wanted | found if wanted.get(name) != found.get(name, wanted)
+            )
+            if config.get("algorithm") != self.algorithm or differing:
+                raise ValueError(
+                    f"out: {folder} holds another training: "
+                    f"{', '.join(differing) or 'algorithm'} differ; use another folder"
+                )
+            return
+        try:
+            with FileLock(folder / LOCK_FILE, timeout=0):
+                name = foreign_entry(folder)
+                if name is not None:
+                    raise ValueError(f"out: {folder} holds something else: {name}")
+        except Timeout:
+            raise ValueError(f"out: another training is writing into {folder}") from None
+
+
+def plan_run(
+    group: tuple[str, ...],
+    seed: int,
+    out: Path,
+    script: ModuleType,
+    own: Sequence[str],
+    words: Sequence[str],
+) -> Run:
+    """Return a run: a learner's script, its `own` words of a command line, those for all runs.
+
+    Raises
+    ------
+    ValueError
+        If an option is refused, or its folder holds a training with other options.
+    """
+    set_here = {*OWN_OPTIONS, *map(option_name, own)}
+    for word in words:
+        if word.startswith("--") and option_name(word) in set_here:
+            raise ValueError(f"{word}: set for each training by the study itself")
+    all_words = ("--seed", str(seed), *own, *words)
+    options = parse_options(script.Args, "", all_words)
+    if not options.evaluation_problems:
+        raise ValueError("evaluation_problems must be at least 1 to compare, got 0")
+    name = "-".join("_".join(cell.split()) for cell in (*group, f"seed{seed}"))
+    run = Run(group, seed, out / name, script.ALGORITHM, options, all_words)
+    run.check_folder()
+    return run
+
+
+# -- all of them -------------------------------------------------------------------------------
+
+# What is summed up over the seeds, and how it is trained: the learner's script, and words of its
+# command line.
+Groups = dict[tuple[str, ...], tuple[ModuleType, tuple[str, ...]]]
+Train = Callable[[Sequence[Run], StopSignals], list[str]]
+
+
+@dataclass
+class StudyArgs(ABC):
+    """Options of any study; all others are handed to the trainings."""
+
+    out: Path = Path("runs/study")
+    """folder of the runs and the tables"""
+    seeds: Annotated[int, Within(1, 10_000)] = 5
+    """trainings of each: seeds 0, 1, 2 ..."""
+    jobs: Annotated[int, Within(1, 1024)] = field(default_factory=lambda: os.cpu_count() or 1)
+    """trainings at a time"""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @abstractmethod
+    def groups(self) -> Groups:
+        """Return what is compared."""
+
+    def plan(self, words: Sequence[str]) -> list[Run]:
+        """Return all runs, those of one seed together; `words` are options for each of them.
+
+        Raises
+        ------
+        ValueError
+            If a learner does not take an option, or a folder holds a training with other options.
+        """
+        return [
+            plan_run(group, seed, self.out, script, own, words)
+            for seed in range(self.seeds)
+            for group, (script, own) in self.groups().items()
+        ]
+
+
+def check_distinct(name: str, values: Sequence[str]) -> None:
+    """Refuse a choice of nothing, or of one thing twice.
+
+    Raises
+    ------
+    ValueError
+        With the option's name.
+    """
+    if not values or len(set(values)) < len(values):
+        raise ValueError(f"{name} must be one or more, none twice, got {values!r}")
+
+
+def run_study(
+    args: StudyArgs,
+    words: Sequence[str],
+    table: str,
+    columns: Sequence[str],
+    train: Train | None = None,
+) -> tuple[int, list[Summary]]:
+    """Train what is not finished, add up, write and print the tables.
+
+    Parameters
+    ----------
+    args, words
+        Options of the study, and those for each of its runs.
+    table, columns
+        Name of the tables, and titles of the cells that name a group.
+    train
+        Trains, and returns what went wrong, a line for each; by default :func:`train_all`.
+
+    Returns
+    -------
+    int, list of Summary
+        The exit code, and what came out of each group if it is 0.
+
+    Raises
+    ------
+    ValueError
+        If an option is refused, the folder cannot be written into, or a training has failed.
+    """
+    runs, signals = args.plan(words), StopSignals()
+    train = train or partial(train_all, jobs=args.jobs)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"out: cannot write into {args.out}: {error}") from error
+    finished = sum(run.finished for run in runs)
+    if finished:
+        print(f"{finished} of {len(runs)} trainings were finished already")
+    with signals:
+        failures = train([run for run in runs if not run.finished], signals)
+    if signals.received is not None:
+        print("stopped early; the same command goes on", flush=True)
+        return 128 + signals.received, []
+    if failures:
+        raise ValueError("these trainings failed: " + "; ".join(failures))
+    summaries = summarise(run.outcome() for run in runs)
+    save_study(args.out / table, columns, summaries)
+    print(f"\n{format_study(columns, summaries)}\n")
+    return 0, summaries
+
+
+def train_all(runs: Sequence[Run], signals: StopSignals, jobs: int) -> list[str]:
+    """Train, `jobs` at a time; return what went wrong, a line for each."""
+    waiting = deque(runs)
+    running: dict[subprocess.Popen[bytes], Run] = {}
     failures: list[str] = []
-    done = len(trials) - len(waiting)
-    if done:
-        print(f"{done} of {len(trials)} trainings were finished already")
-    total = sum(t.options.n_episodes for t in trials)
-    progress = tqdm(total=total, unit=" episodes", disable=None)  # None: if there is no terminal
+    done = 0
+    total = sum(run.options.n_episodes for run in runs)
+    bar = tqdm(total=total, unit=" episodes", disable=None)  # None: if there is no terminal
     told = False
     try:
         while running or (waiting and signals.received is None):
             while waiting and len(running) < jobs and signals.received is None:
-                trial = waiting.popleft()
-                running[start(trial)] = trial
+                run = waiting.popleft()
+                running[run.start()] = run
             time.sleep(0.2)
             if signals.received is not None and not told:
                 told = True
                 for process in running:
                     process.terminate()
             for process in [p for p in running if p.poll() is not None]:
-                trial = running.pop(process)
-                if process.returncode == 0 and trial.finished:
+                run = running.pop(process)
+                if process.returncode == 0 and run.finished:
                     done += 1
-                    progress.write(f"{done}/{len(trials)} {trial.name}")
+                    bar.write(f"{done}/{len(runs)} {run.name}")
                 elif signals.received is None:
-                    failures.append(f"{trial.name}: {last_line(trial.log)}")
-                    progress.write(f"failed: {failures[-1]}")
-            progress.n = sum(count_episodes(t) for t in trials)
-            progress.set_postfix(finished=f"{done}/{len(trials)}")
+                    failures.append(f"{run.name}: {run.last_words()}")
+                    bar.write(f"failed: {failures[-1]}")
+            bar.n = sum(run.count_episodes() for run in runs)
+            bar.set_postfix(finished=f"{done}/{len(runs)}")
     finally:
         for process in running:
             process.terminate()
         for process in running:
             process.wait()
-        progress.close()
+        bar.close()
     return failures
-
-
-def start(trial: Trial) -> subprocess.Popen[bytes]:
-    """Start a training in a process of its own."""
-    root = str(Path(__file__).resolve().parents[2])
-    paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
-    with trial.log.open("ab") as log:
-        return subprocess.Popen(
-            trial.command,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            # Ctrl-C is for this process, which passes one signal on: a second would cut a
-            # checkpoint short.
-            start_new_session=True,
-        )
-
-
-def last_line(path: Path) -> str:
-    """Return the last line of a log that says something."""
-    lines = path.read_text(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "ended without a word"
-
-
-def count_episodes(trial: Trial) -> int:
-    """Return how many episodes are in a training's metrics.csv so far."""
-    try:
-        return max((trial.folder / METRICS_FILE).read_bytes().count(b"\n") - 1, 0)
-    except OSError:
-        return 0
-
-
-# -- figures of one training -------------------------------------------------------------------
-
-
-class Outcome(NamedTuple):
-    """What came out of one trial."""
-
-    trial: Trial
-    measures: dict[str, float]  # a key of MEASURES each; NaN where there is none
-    returns: np.ndarray  # (episodes,), while training
-    solved: np.ndarray  # (episodes,) 0 or 1
-
-
-MEASURES = {
-    "solved %": "solved %",
-    "gap %": "gap %",
-    "optimal %": "optimal %",
-    "cover time": "cover time, unsolved = limit",
-    "return": f"return of the last {RETURN_EPISODES} episodes",
-    "minutes": "minutes",
-}
-
-
-def read_outcome(trial: Trial) -> Outcome:
-    """Read what came out of a trial.
-
-    Raises
-    ------
-    ValueError
-        If a file of it cannot be read.
-    """
-    path = trial.folder / EVALUATION_FILE
-    content = read_bytes(path, MAX_TABLE_BYTES, "a table", ValueError)
-    text = content.decode("utf-8", errors="replace")
-    rows = {row.get("policy"): row for row in csv.DictReader(io.StringIO(text))}
-    metrics = read_metrics(trial.folder)
-    limit = trial.options.max_cycles
-    try:
-        row = rows[ROW]
-        timing_file = trial.folder / TIMING_FILE
-        timing = parse_json(read_bytes(timing_file, MAX_TABLE_BYTES, "a timing file", ValueError))
-        returns, solved = np.array(metrics["reward"]), np.array(metrics["solved"])
-        measures = {
-            "solved %": float(row["solved %"]),
-            "gap %": float(row["gap %"]),
-            "optimal %": float(row["optimal %"]),
-            "cover time": float(row[f"unsolved = {limit}"]),
-            "return": float(returns[-RETURN_EPISODES:].mean()),
-            "minutes": float(timing["seconds_total"]) / 60.0,
-        }
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not the evaluation of a training: {error!r}") from error
-    return Outcome(trial, measures, returns, solved)
-
-
-# -- statistics --------------------------------------------------------------------------------
-
-
-class Interval(NamedTuple):
-    """An interquartile mean over seeds, and its bootstrap interval; NaN where there is none."""
-
-    mean: np.ndarray  # of the shape of one value
-    low: np.ndarray
-    high: np.ndarray
-    n: int  # values
-
-
-def interval(values: np.ndarray) -> Interval:
-    """Return the interquartile mean over the first axis and its 95 % bootstrap interval.
-
-    The interval is that of the percentiles of 10,000 resamples (2,000 of curves) drawn by a
-    generator of its own, so that the same runs give the same table.
-    """
-    n = len(values)
-    if n == 0:
-        nothing = np.full(values.shape[1:], np.nan)
-        return Interval(nothing, nothing, nothing, 0)
-    mean = np.asarray(stats.trim_mean(values, CUT, axis=0))
-    if n == 1:
-        nothing = np.full(mean.shape, np.nan)
-        return Interval(mean, nothing, nothing, 1)
-    curve = values.ndim > 1
-    found = stats.bootstrap(
-        (values,),
-        lambda sample, axis: stats.trim_mean(sample, CUT, axis=axis),
-        axis=0,
-        n_resamples=2_000 if curve else N_RESAMPLES,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        batch=200 if curve else None,
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return Interval(mean, np.asarray(found.low), np.asarray(found.high), n)
-
-
-class Summary(NamedTuple):
-    """What came out of a group of trainings, over its seeds."""
-
-    group: tuple[str, ...]
-    outcomes: list[Outcome]
-    measures: dict[str, Interval]
-
-
-def summarise(outcomes: Iterable[Outcome]) -> list[Summary]:
-    """Put the outcomes of all seeds of a group together, in their order."""
-    groups: dict[tuple[str, ...], list[Outcome]] = {}
-    for outcome in outcomes:
-        groups.setdefault(outcome.trial.group, []).append(outcome)
-    summaries = []
-    for group, members in groups.items():
-        measures = {}
-        for name in MEASURES:
-            values = np.array([outcome.measures[name] for outcome in members])
-            # Who solves no problem has no gap.
-            measures[name] = interval(values[~np.isnan(values)])
-        summaries.append(Summary(group, members, measures))
-    return summaries
-
-
-# -- what is written ---------------------------------------------------------------------------
-
-
-def format_study(columns: Sequence[str], summaries: Sequence[Summary]) -> str:
-    """Return the Markdown table; `columns` are the titles of the groups' cells."""
-    lines = [
-        "| " + " | ".join([*columns, "seeds", *MEASURES.values()]) + " |",
-        "|---" * len(columns) + "|" + "---:|" * (1 + len(MEASURES)),
-    ]
-    for summary in summaries:
-        n = len(summary.outcomes)
-        cells = [format_interval(found, n) for found in summary.measures.values()]
-        lines.append(f"| {' | '.join(summary.group)} | {n} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def format_interval(found: Interval, n_seeds: int) -> str:
-    """Return a mean, its interval, and how many seeds have a value if not all have one."""
-    if found.n == 0:
-        return "-"
-    text = f"{found.mean:.2f}"
-    if not math.isnan(found.low):
-        text += f" [{found.low:.2f}, {found.high:.2f}]"
-    return text if found.n == n_seeds else f"{text} ({found.n} of {n_seeds})"
-
-
-def save_study(path: Path, columns: Sequence[str], summaries: Sequence[Summary]) -> None:
-    """Write PATH.csv (all digits) and PATH.md."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    parts = [f"{name} {part}" for name in MEASURES for part in ("IQM", "low", "high", "n")]
-    writer.writerow([*columns, "seeds", *parts])
-    for summary in summaries:
-        figures = [value for found in summary.measures.values() for value in found]
-        writer.writerow([*summary.group, len(summary.outcomes), *figures])
-    table = format_study(columns, summaries) + "\n"
-    write_text(path.with_suffix(".csv"), text.getvalue(), MAX_TABLE_BYTES)
-    write_text(path.with_suffix(".md"), table, MAX_TABLE_BYTES)
-
-
-def run_study(
-    trials: Sequence[Trial], path: Path, columns: Sequence[str], jobs: int
-) -> tuple[int, list[Summary]]:
-    """Train what is not finished, add up, write the tables; return exit code and summaries.
-
-    Raises
-    ------
-    ValueError
-        If the folder cannot be written into, or a training has failed.
-    """
-    make_folder(path.parent)
-    signals = StopSignals()
-    with signals:
-        failures = train_all(trials, jobs, signals)
-    if signals.received is not None:
-        print("stopped early; the same command goes on", flush=True)
-        return 128 + signals.received, []
-    if failures:
-        raise ValueError("these trainings failed: " + "; ".join(failures))
-    return 0, gather(trials, path, columns)
-
-
-def make_folder(folder: Path) -> None:
-    """Make the folder of a study.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"out: cannot write into {folder}: {error}") from error
-
-
-def gather(trials: Sequence[Trial], path: Path, columns: Sequence[str]) -> list[Summary]:
-    """Add up what came out of finished trainings, write and print the tables.
-
-    Raises
-    ------
-    ValueError
-        If a file of a training cannot be read.
-    """
-    summaries = summarise([read_outcome(trial) for trial in trials])
-    save_study(path, columns, summaries)
-    print(f"\n{format_study(columns, summaries)}\n")
-    return summaries

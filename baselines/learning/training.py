@@ -1,35 +1,39 @@
-"""A training: problems one after the other, episode by episode, whoever learns.
+"""Reinforcement learning: problems one after the other, episode by episode, for any learner."""
 
-It advances by one step or one update at a time, and between any two of them it can be stopped,
-saved and carried on, to the same bytes.
-"""
-
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from baselines.learning.config import Options
-from baselines.policies.guidance import Guidance, LinearSchedule
+from baselines.learning.config import Options, own_options
+from baselines.learning.train import Trainable, run_training
+from baselines.networks import Network
+from baselines.policies.acting import Acting
+from baselines.policies.evaluation import EVALUATION_SEED, Evaluation
+from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
 from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import N_ACTIONS
-from baselines.runs.folder import Stopwatch
-from mapp_env import Grid, mapp_v0
+from baselines.policies.rules_of_thumb import RandomPolicy
+from baselines.policies.settings import N_ACTIONS, Setting, read_setting
+from baselines.runs.checkpoints import Saved
+from mapp_env import Grid, mapp_v0, sample_problems
+from mapp_env.grids import find_grid
 
 METRICS = (
     *("episode", "problem", "steps", "reward", "solved", "epsilon", "guidance"),
     *("updates", "loss"),
 )
+DRAWN = ("network alone", "network, guidance 1")  # whose routes are
 
 
-class Learner(Protocol):
+class Learner(Saved, Protocol):
     """What is trained."""
 
     updates: int
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Return the greedy joint action (N,)."""
-        ...
 
     def remember(
         self,
@@ -39,33 +43,17 @@ class Learner(Protocol):
         next_observation: np.ndarray,
         terminated: bool,
     ) -> None:
-        """Take note of a transition."""
-        ...
+        """Store a transition."""
 
     @property
     def ready(self) -> bool:
         """Whether there is something to learn from."""
-        ...
 
     def update(self, progress: float) -> float:
         """Learn from one batch; return the loss."""
-        ...
 
     def policy(self) -> NetworkPolicy:
         """Return what was learned."""
-        ...
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays that change, by name."""
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
-        ...
-
-    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what the two above returned."""
-        ...
 
 
 class Streams(NamedTuple):
@@ -98,8 +86,8 @@ class Progress:
     updates: int = 0  # of the episode
 
 
-class Training:
-    """A training that can be stopped between any two steps or updates, and carried on.
+class Training(Trainable):
+    """Episodes, the updates that are due after steps and episodes, and what is logged.
 
     Parameters
     ----------
@@ -113,8 +101,12 @@ class Training:
         What is trained.
     """
 
+    UNIT, COLUMNS, SHOWN = "episodes", METRICS, ("steps", "reward")
+    args: Options
+
     def __init__(self, args: Options, grid: Grid, problems: np.ndarray, learner: Learner) -> None:
-        self.args, self.problems, self.learner = args, problems, learner
+        super().__init__(args, args.n_episodes, args.episodes_per_problem)
+        self.problems, self.learner = problems, learner
         self.env = mapp_v0.parallel_env(
             grid=grid,
             n_agents=args.n_agents,
@@ -130,25 +122,29 @@ class Training:
             args.guidance_start, args.guidance_end, round(args.guidance_fraction * args.n_episodes)
         )
         self.now = Progress()
-        self.watch = Stopwatch()
         self.observation = self._reset()
 
     @property
-    def finished(self) -> bool:
-        """Whether all episodes are over."""
-        return self.now.episodes >= self.args.n_episodes
+    def network(self) -> Network:
+        """What was learned."""
+        return self.learner.policy().network
 
     @property
     def problem(self) -> int:
         """Index of the problem that is being trained on."""
         return self.now.episodes // self.args.episodes_per_problem
 
+    def counts(self) -> dict[str, int]:
+        """Return what was done so far."""
+        now = self.now
+        return {"episodes": now.episodes, "steps": now.steps, "updates": self.learner.updates}
+
     def advance(self) -> dict[str, object] | None:
         """Carry out one update or one step; return the row of an episode that it ends."""
         now, args = self.now, self.args
         if now.pending:
             # An episode's updates are spread evenly over it.
-            done = now.episodes
+            done: float = now.episodes
             if args.updates_per_episode:
                 done += 1 - now.pending / max(args.updates_per_episode, now.pending)
             now.losses += self.learner.update(done / args.n_episodes)
@@ -162,17 +158,16 @@ class Training:
     def _step(self) -> None:
         now, args = self.now, self.args
         now.epsilon = self.epsilon_at(now.steps)
-        actions = self._choose(now.epsilon)
+        obs, actions = self.observation, self._choose(now.epsilon)
         self.watch.lap("network acts")
         influence = self.guidance_at(now.episodes)
-        seen = self.observation
         if influence > 0.0:
-            actions = self.guidance.apply(actions[None], seen[None], influence, self.rng)[0]
+            actions = self.guidance.apply(actions[None], obs[None], influence, self.rng)[0]
         self.watch.lap("guidance")
-        following, reward, terminated, truncated = self._play(actions.tolist())
+        next_obs, reward, terminated, truncated = self._step_env(actions.tolist())
         self.watch.lap("env")
-        self.learner.remember(seen, actions, reward, following, terminated)
-        self.observation = following
+        self.learner.remember(obs, actions, reward, next_obs, terminated)
+        self.observation = next_obs
         now.actions.append(actions.tolist())
         now.reward += reward
         now.steps += 1
@@ -193,17 +188,17 @@ class Training:
             return random_actions
         return np.where(explores, random_actions, self.learner.act(self.observation))
 
-    def _play(self, actions: list[int]) -> tuple[np.ndarray, float, bool, bool]:
+    def _step_env(self, actions: list[int]) -> tuple[np.ndarray, float, bool, bool]:
         commands = dict(zip(self.env.agents, actions, strict=True))
-        seen, rewards, terminations, truncations, _ = self.env.step(commands)
+        obs, rewards, terminations, truncations, _ = self.env.step(commands)
         leader = self.leader
-        return seen[leader], rewards[leader], terminations[leader], truncations[leader]
+        return obs[leader], rewards[leader], terminations[leader], truncations[leader]
 
     def _reset(self) -> np.ndarray:
         problem = min(self.problem, len(self.problems) - 1)
-        seen, _ = self.env.reset(options={"landmarks": self.problems[problem].tolist()})
-        observation: np.ndarray = seen[self.leader]
-        return observation
+        landmarks = self.problems[problem].tolist()
+        obs: np.ndarray = self.env.reset(options={"landmarks": landmarks})[0][self.leader]
+        return obs
 
     def _end_episode(self) -> dict[str, object]:
         now = self.now
@@ -225,11 +220,6 @@ class Training:
 
     # -- checkpoints
 
-    @property
-    def number(self) -> int:
-        """Steps and updates so far."""
-        return self.now.steps + self.learner.updates
-
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""
         return self.learner.arrays()
@@ -245,16 +235,7 @@ class Training:
         }
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what :meth:`arrays` and :meth:`state` returned.
-
-        What follows from the actions is not taken over: the episode so far is played again, as the
-        rules leave nothing to chance.
-
-        Raises
-        ------
-        ValueError
-            If something that must be there is not.
-        """
+        """Take over what was saved; the episode so far is played again, as nothing is chance."""
         self.now = now = Progress(**state["progress"])
         self.rng.bit_generator.state = state["rng"]
         self.learner.restore(arrays, state["learner"])
@@ -262,18 +243,12 @@ class Training:
         self.observation = self._reset()
         now.reward, now.solved, now.over = 0.0, False, False
         for actions in now.actions:
-            self.observation, reward, now.solved, truncated = self._play(actions)
+            self.observation, reward, now.solved, truncated = self._step_env(actions)
             now.reward += reward
             now.over = now.solved or truncated
 
     def check_metrics(self, table: dict[str, list[float]]) -> None:
-        """Compare where it stands with the rows of its finished episodes.
-
-        Raises
-        ------
-        ValueError
-            If they differ.
-        """
+        """Compare where it stands with the rows of its finished episodes."""
         now = self.now
         finished = now.episodes, now.steps - len(now.actions), self.learner.updates - now.updates
         logged = len(table["episode"]), sum(table["steps"]), sum(table["updates"])
@@ -282,3 +257,68 @@ class Training:
                 f"finished episodes, their steps and updates are {finished} by it, and {logged} by "
                 "metrics.csv"
             )
+
+    # -- what comes out
+
+    def rivals(self, policy: NetworkPolicy) -> dict[str, Acting]:
+        """Return random agents, and with a training that was guided, guided ones."""
+        args = self.args
+        # As many streams as rows, so that a row keeps its stream whatever rows there are.
+        rngs = iter(np.random.default_rng(EVALUATION_SEED).spawn(8))
+        chance = RandomPolicy(args.n_agents, N_ACTIONS, next(rngs))
+        if args.guidance_start == 0.0:
+            return {"random": chance}
+
+        def guided(acting: Acting, influence: float) -> GuidedPolicy:
+            return GuidedPolicy(acting, self.guidance, influence, next(rngs))
+
+        rows: dict[str, Acting] = {}
+        if 0.0 < args.guidance_end < 1.0:
+            rows[f"network, guidance {args.guidance_end:g}"] = guided(policy, args.guidance_end)
+        rows["network, guidance 1"] = guided(policy, 1.0)
+        return rows | {"random": chance, "random, guidance 1": guided(chance, 1.0)}
+
+    def draw(self, folder: Path, evaluations: dict[str, Evaluation]) -> None:
+        """Draw the paper's figures 2, 3 and 4."""
+        # Only here, because drawing takes longer to import than everything before.
+        from baselines.policies.figures import draw_learning_curves, draw_routes
+
+        draw_learning_curves(folder)
+        if evaluations:
+            routes = {label: evaluations[label] for label in DRAWN if label in evaluations}
+            draw_routes(folder, routes)
+
+
+def training_problems(args: Options, grid: Grid) -> np.ndarray:
+    """Draw the problems of a training, from its seed: (P, K)."""
+    return sample_problems(
+        grid,
+        args.n_problems,
+        n_landmarks=args.n_landmarks,
+        seed=int(Streams.spawn(args.seed).problems.generate_state(1)[0]),
+    )
+
+
+def train_learner(
+    args: Options, algorithm: str, make_learner: Callable[[Any, Grid, Streams], Learner]
+) -> int:
+    """Train a learner, evaluate, draw; return the exit code.
+
+    Raises
+    ------
+    ValueError
+        If an option or the folder cannot be used.
+    """
+    args = own_options(args, algorithm)
+    if args.resume is None:
+        setting = Setting(find_grid(args.grid), args.n_agents, args.n_landmarks, args.max_cycles)
+        problems = training_problems(args, setting.grid)
+    else:
+        setting, rows = read_setting(args.resume)
+        problems = np.array(rows, np.int32)
+
+    def make_training() -> Training:
+        learner = make_learner(args, setting.grid, Streams.spawn(args.seed))
+        return Training(args, setting.grid, problems, learner)
+
+    return run_training(args, algorithm, setting, problems.tolist(), make_training)

@@ -4,6 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
+from baselines.networks import ANY
 from mapp_env import Grid
 from mapp_env.grid import tell_apart
 
@@ -27,7 +28,8 @@ def check_grid(policy: object, grid: Grid) -> None:
     own = getattr(policy, "grid", None)
     if isinstance(own, Grid) and own != grid:
         raise ValueError(
-            f"policy must be one of this grid, got one of another; here {tell_apart(grid, own)}"
+            f"policy must be one of this grid, or of any, got one of another; here "
+            f"{tell_apart(grid, own)}"
         )
 
 
@@ -55,6 +57,8 @@ def check_observations(
 ) -> np.ndarray:
     """Return the observations as a fresh float32 array when they can come from the env.
 
+    With `n_cells` ANY they may come from any grid.
+
     Raises
     ------
     ValueError
@@ -68,8 +72,9 @@ def check_observations(
         )
     n_cell_inputs = n_agents + n_landmarks
     cells, flags = array[:, :n_cell_inputs], array[:, n_cell_inputs:]
-    if not ((cells >= 0) & (cells < n_cells) & (cells == np.floor(cells))).all():
-        raise ValueError(f"observations must have cells in 0..{n_cells - 1}, got something else")
+    limit = np.inf if n_cells == ANY else n_cells
+    if not ((cells >= 0) & (cells < limit) & (cells == np.floor(cells))).all():
+        raise ValueError(f"observations must have cells in 0..{limit - 1}, got something else")
     if not ((flags == 0) | (flags == 1)).all():
         raise ValueError("observations must have visited flags 0 or 1, got something else")
     return array.astype(np.float32)

@@ -15,13 +15,13 @@ from mapp_env.grid import pairs_of
 class Episodes(NamedTuple):
     """One episode on each of P problems; zero after its end."""
 
-    observations: np.ndarray  # (T, P, N + 2K) float32
+    obs: np.ndarray  # (T, P, N + 2K) float32
     joint: np.ndarray  # (T, P) int64, joint actions
     lengths: np.ndarray  # (P,) int64 steps until all was visited, the limit + 1 if it was not
 
 
 def make_envs(setting: Setting, n_rows: int, max_length: int) -> gymnasium.vector.VectorEnv:
-    """Return environments for :func:`play`, which gives them their problems."""
+    """Return environments for :func:`rollout`, which gives them their problems."""
     return make_vec(
         n_rows,
         autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
@@ -35,19 +35,19 @@ def make_envs(setting: Setting, n_rows: int, max_length: int) -> gymnasium.vecto
 def begin(
     envs: gymnasium.vector.VectorEnv, landmarks: np.ndarray, seed: int | None = None
 ) -> np.ndarray:
-    """Start an episode on each row of landmarks (P, K); return what is seen, (P, N + 2K)."""
+    """Start an episode on each row of landmarks (P, K); return the observations (P, N + 2K)."""
     # As pairs: two rows of two cells could as well be two pairs.
     pairs = pairs_of(envs.unwrapped.task.grid, landmarks)  # type: ignore[attr-defined]
-    observations: np.ndarray = envs.reset(seed=seed, options={"landmarks": pairs})[0]
-    return observations
+    obs: np.ndarray = envs.reset(seed=seed, options={"landmarks": pairs})[0]
+    return obs
 
 
-def play(
+def rollout(
     envs: gymnasium.vector.VectorEnv,
     network: Network,
     landmarks: np.ndarray,
     max_length: int,
-    sharpness: float,
+    inverse_temperature: float,
     greedy: np.ndarray,
     rng: np.random.Generator,
 ) -> Episodes:
@@ -58,40 +58,40 @@ def play(
     envs
         As many environments as there are rows.
     network
-        Its values, times the sharpness, are the logits of the actions.
+        Its values, times the inverse temperature, are the logits of the actions.
     landmarks
         (P, K), each row ascending.
     max_length
         Steps after which an episode is given up.
-    sharpness
-        See above.
+    inverse_temperature
+        The larger, the likelier the action of the largest value.
     greedy
         (P,) bool, rows that take the action of the largest value.
     rng
         Source of all draws.
     """
-    seen = begin(envs, landmarks)
+    obs = begin(envs, landmarks)
     spec, n_rows = network.spec, len(landmarks)
-    playing = np.arange(n_rows)
+    running = np.arange(n_rows)
     lengths = np.full(n_rows, max_length + 1)
     observations, actions = [], []
     for step in range(1, max_length + 1):
-        here = np.zeros_like(seen)
-        here[playing] = seen[playing]
+        here = np.zeros_like(obs)
+        here[running] = obs[running]
         with torch.inference_mode():
-            scores = network(torch.from_numpy(seen[playing])).numpy()
+            scores = network(torch.from_numpy(obs[running])).numpy()
         # The largest of logits and Gumbel noise is a draw from the policy.
         chance = rng.standard_exponential(scores.shape, np.float32)
         noise = -np.log(np.maximum(chance, np.finfo(np.float32).tiny))
-        noise[greedy[playing]] = 0.0
+        noise[greedy[running]] = 0.0
         joint = np.zeros(n_rows, np.int64)
-        joint[playing] = (sharpness * scores + noise).argmax(axis=1)
+        joint[running] = (inverse_temperature * scores + noise).argmax(axis=1)
         observations.append(here)
         actions.append(joint)
-        seen, _, terminated, _, _ = envs.step(split_joint(joint, spec.n_agents, spec.n_actions))
-        lengths[playing[terminated[playing]]] = step
-        playing = playing[~terminated[playing]]
-        if not len(playing):
+        obs, _, terminated, _, _ = envs.step(split_joint(joint, spec.n_agents, spec.n_actions))
+        lengths[running[terminated[running]]] = step
+        running = running[~terminated[running]]
+        if not len(running):
             break
     return Episodes(np.stack(observations), np.stack(actions), lengths)
 

@@ -8,20 +8,18 @@ import csv
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines.policies.acting import Acting, check_grid
-from baselines.policies.episodes import begin
-from baselines.policies.policy import EarliestArrivalPolicy, NearestLandmarkPolicy
+from baselines.policies.episodes import begin, make_envs
 from baselines.policies.settings import Setting
-from mapp_env import Problem, make_vec, sample_problems, solve
+from mapp_env import Plan, Problem, replay, sample_problems, solve
 from mapp_env.files import write_text
-from mapp_env.grid import MAX_ALL_PAIRS_CELLS
+from mapp_env.problem import MAX_CYCLES
 from mapp_env.solvers import optimal_costs, solve_universe
 from mapp_env.validation import check_count
 
@@ -112,30 +110,7 @@ def _optimal_costs(setting: Setting, landmarks: np.ndarray, objective: str) -> n
     return np.array([solve(problem, objective, "exact").cost for problem in problems], np.int32)
 
 
-# -- rules of thumb ----------------------------------------------------------------------------
-
-RULES = {
-    "nearest": ("nearest landmark", NearestLandmarkPolicy),
-    "earliest": ("earliest arrival", EarliestArrivalPolicy),
-}
-"""Rules without a network by what commands call them: how tables call them, and who they are."""
-
-
-def rules_of_thumb(setting: Setting) -> dict[str, Acting]:
-    """Return the rules that every table has beside the policies, by how tables call them.
-
-    There are none, and a line says so, on a grid for which the distances of all pairs of cells are
-    not kept.
-    """
-    if setting.grid.n_cells > MAX_ALL_PAIRS_CELLS:
-        names = " and ".join(label for label, _ in RULES.values())
-        print(f"no rows for {names}: the grid has more than {MAX_ALL_PAIRS_CELLS:,} cells")
-        return {}
-    task = setting.grid, setting.n_agents, setting.n_landmarks
-    return {label: rule(*task) for label, rule in RULES.values()}
-
-
-# -- playing -----------------------------------------------------------------------------------
+# -- episodes -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -232,14 +207,7 @@ def evaluate(
     n_problems = len(landmarks)
     n_kept = min(n_kept, n_problems)
     batch = min(BATCH, n_problems)
-    envs = make_vec(
-        batch,
-        autoreset_mode=gymnasium.vector.AutoresetMode.NEXT_STEP,
-        grid=setting.grid,
-        n_agents=setting.n_agents,
-        n_landmarks=setting.n_landmarks,
-        max_cycles=setting.max_cycles,
-    )
+    envs = make_envs(setting, batch, setting.max_cycles)
     costs = {name: np.full(n_problems, np.inf) for name in OBJECTIVES}
     success = np.zeros(n_problems, np.bool_)
     steps = np.zeros(n_problems, np.int64)
@@ -254,25 +222,25 @@ def evaluate(
     for start in range(0, n_problems, batch):
         # The last batch is filled up with problems played before; they are not read again.
         rows = np.minimum(np.arange(start, start + batch), n_problems - 1)
-        playing = np.arange(batch) < n_problems - start
+        unfinished = np.arange(batch) < n_problems - start
         observations = begin(envs, landmarks[rows], seed=0)
         actions = np.zeros((batch, setting.n_agents), np.int64)
-        step = 0
-        while playing.any():
-            actions[playing] = policy.act(observations[playing])
+        for step in range(setting.max_cycles):
+            actions[unfinished] = policy.act(observations[unfinished])
             if start < n_kept:
-                drawn = playing & (rows < n_kept)
+                drawn = unfinished & (rows < n_kept)
                 kept[step, rows[drawn]] = actions[drawn]
             observations, _, terminated, truncated, infos = envs.step(actions)
-            step += 1
-            ended = playing & (terminated | truncated)
+            ended = unfinished & (terminated | truncated)
             if ended.any():
-                steps[rows[ended]] = step
+                steps[rows[ended]] = step + 1
                 success[rows[ended]] = infos["metrics"]["success"][ended]
                 for name, cost in costs.items():
                     cost[rows[ended]] = infos["metrics"][name][ended]
                 bar.update(int(ended.sum()))
-            playing &= ~ended  # what the row plays after its reset is nobody's problem
+            unfinished &= ~ended  # what the row plays after its reset is nobody's problem
+            if not unfinished.any():
+                break
     bar.close()
     envs.close()
     return Evaluation(
@@ -284,6 +252,42 @@ def evaluate(
         actions=kept,
         optima=optima,
     )
+
+
+def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = None) -> list[Plan]:
+    """Return what the rules make of a policy's episodes: closed loop, no search.
+
+    Parameters
+    ----------
+    policy
+        Who commands the agents.
+    problems
+        Of any of the policy's grids, numbers of agents and of landmarks.
+    max_cycles
+        Step limit of all of them. By default each problem's own or, if it has none, as many steps
+        as one agent alone needs that walks from each landmark to the next.
+
+    Raises
+    ------
+    ValueError
+        If the policy is of another grid than a problem, or cannot play it.
+    """
+    alike: dict[Setting, list[int]] = {}
+    for index, problem in enumerate(problems):
+        grid, n_landmarks = problem.grid, len(problem.landmarks)
+        limit = problem.max_cycles if max_cycles is None else max_cycles
+        if limit is None:
+            limit = min(2 * int(np.max(grid.home)) * n_landmarks, MAX_CYCLES)
+        setting = Setting(grid, problem.n_agents, n_landmarks, limit)
+        alike.setdefault(setting, []).append(index)
+    plans = {}
+    for setting, indices in alike.items():
+        landmarks = np.array([problems[index].landmarks for index in indices])
+        episodes = evaluate(policy, setting, landmarks, n_kept=len(indices))
+        for row, index in enumerate(indices):
+            problem = replace(problems[index], max_cycles=setting.max_cycles)
+            plans[index] = replay(problem, episodes.actions[: episodes.steps[row], row])
+    return [plans[index] for index in range(len(problems))]
 
 
 # -- tables ------------------------------------------------------------------------------------

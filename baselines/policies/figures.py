@@ -121,9 +121,9 @@ def draw_comparison(
     folder
         Where comparison.png is written.
     summaries
-        A ``studies.Summary`` for each learner under each preset.
+        A ``summary.Summary`` for each learner under each preset.
     interval
-        Gives the mean over the first axis, and its interval: ``studies.interval``.
+        Gives the mean over the first axis, and its interval: ``summary.interval``.
     window
         Episodes in the running mean of each seed.
     """
@@ -140,28 +140,14 @@ def draw_comparison(
     )
     for preset, row in zip(presets, grid, strict=True):
         shown = [summary for summary in summaries if summary.group[0] == preset]
-        for summary in shown:
+        for height, summary in enumerate(shown):
             colour = LEARNER_COLOURS[learners.index(summary.group[1]) % len(LEARNER_COLOURS)]
             for axes, name, factor in ((row[0], "returns", 1.0), (row[1], "solved", 100.0)):
-                curves = [getattr(outcome, name) for outcome in summary.outcomes]
-                width = min(window, min(map(len, curves)))
-                smooth = [np.convolve(c, np.ones(width) / width, mode="valid") for c in curves]
-                found = interval(factor * np.array(smooth))
-                episodes = np.arange(width, width + len(found.mean))
-                axes.plot(episodes, found.mean, color=colour, label=summary.group[1])
-                if found.n > 1:
-                    axes.fill_between(
-                        episodes, found.low, found.high, color=colour, alpha=0.2, linewidth=0
-                    )
-            height = -shown.index(summary)
+                curves = [factor * getattr(outcome, name) for outcome in summary.outcomes]
+                _draw_mean_curve(axes, curves, interval, window, colour, summary.group[1])
             for axes, name in ((row[2], "solved %"), (row[3], "gap %")):
-                found = summary.measures[name]
                 values = [outcome.measures[name] for outcome in summary.outcomes]
-                axes.plot(values, [height] * len(values), "|", color=colour, alpha=0.6)
-                if found.n:
-                    axes.plot(found.mean, height, "o", color=colour)
-                if found.n > 1:
-                    axes.plot([found.low, found.high], [height] * 2, color=colour, linewidth=3)
+                _draw_interval(axes, values, summary.measures[name], -height, colour)
         row[0].set(ylabel=f"preset {preset}\nreturn, training", xlabel="Episode")
         row[1].set(ylabel="solved %, training", xlabel="Episode", ylim=(-3, 103))
         row[2].set(xlabel="solved %, unseen problems", xlim=(-3, 103))
@@ -179,6 +165,32 @@ def draw_comparison(
         fontsize="medium",
     )
     return _save(figure, folder / "comparison.png")
+
+
+def _draw_mean_curve(
+    axes: Axes,
+    curves: Sequence[np.ndarray],
+    interval: Callable[[np.ndarray], Any],
+    window: int,
+    colour: str,
+    label: str,
+) -> None:
+    width = min(window, min(map(len, curves)))
+    found = interval(np.array([np.convolve(c, np.ones(width) / width, "valid") for c in curves]))
+    episodes = np.arange(width, width + len(found.mean))
+    axes.plot(episodes, found.mean, color=colour, label=label)
+    if found.n > 1:
+        axes.fill_between(episodes, found.low, found.high, color=colour, alpha=0.2, linewidth=0)
+
+
+def _draw_interval(
+    axes: Axes, values: Sequence[float], found: Any, height: int, colour: str
+) -> None:
+    axes.plot(values, [height] * len(values), "|", color=colour, alpha=0.6)
+    if found.n:
+        axes.plot(found.mean, height, "o", color=colour)
+    if found.n > 1:
+        axes.plot([found.low, found.high], [height] * 2, color=colour, linewidth=3)
 
 
 def _save(figure: Figure, path: Path) -> Path:

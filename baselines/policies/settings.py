@@ -2,13 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from baselines.networks import NetworkSpec
+from baselines.policies.policy import NetworkPolicy, find_weights, load_policy
 from baselines.runs.folder import CONFIG_FILE, read_config
 from mapp_env import Grid, Problem
+from mapp_env.engine.state import N_ACTIONS
+from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, MAX_LANDMARKS
 from mapp_env.validation import check_count
 
-N_ACTIONS = 4
+__all__ = ["N_ACTIONS", "PolicyOfRun", "Setting", "check_fits", "load_run", "read_setting"]
 
 
 @dataclass(frozen=True)
@@ -20,22 +23,42 @@ class Setting:
     n_landmarks: int = 5
     max_cycles: int = 50
 
+    def problem(self, landmarks: tuple[int, ...]) -> Problem:
+        """Return the problem of some landmarks.
 
-def read_grid(folder: Path) -> Grid:
-    """Read from a run folder which grid was trained on.
+        Raises
+        ------
+        ValueError
+            If there are not as many as in the setting, or one is invalid.
+        """
+        if len(landmarks) != self.n_landmarks:
+            raise ValueError(
+                f"landmarks must be {self.n_landmarks} cells for this policy, got {len(landmarks)}"
+            )
+        return Problem(self.grid, landmarks, self.n_agents, self.max_cycles)
+
+
+class PolicyOfRun(NamedTuple):
+    """A trained policy, its task, and the problems that its training began with."""
+
+    policy: NetworkPolicy
+    setting: Setting
+    problems: list[tuple[int, ...]]
+
+
+def load_run(name: str | Path, device: str = "cpu") -> PolicyOfRun:
+    """Load a policy and what its run folder says of it.
 
     Raises
     ------
     ValueError
-        If the run's config does not say it.
+        If there is no such policy, or its folder does not say what it was trained for.
     """
-    config = read_config(folder)
-    try:
-        return Grid.from_text(config["grid"])
-    except KeyError as error:
-        raise ValueError(f"{folder / CONFIG_FILE}: no entry {error}") from error
-    except ValueError as error:
-        raise ValueError(f"{folder / CONFIG_FILE}: grid: {error}") from error
+    policy = load_policy(name, device)
+    folder = find_weights(name).parent
+    setting, problems = read_setting(folder)
+    check_fits(policy, setting, folder)
+    return PolicyOfRun(policy, setting, problems)
 
 
 def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
@@ -44,7 +67,7 @@ def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
     Raises
     ------
     ValueError
-        If the run's config does not say it, or says what cannot be.
+        If the run's config does not say it, or says something invalid.
     """
     config = read_config(folder)
     where = f"{folder / CONFIG_FILE}"
@@ -54,51 +77,43 @@ def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
             raise ValueError("options must be an object, training_problems a list")
         setting = Setting(
             Grid.from_text(config["grid"]),
-            options["n_agents"],
-            options["n_landmarks"],
-            options["max_cycles"],
+            check_count("n_agents", options["n_agents"], 1, MAX_AGENTS),
+            check_count("n_landmarks", options["n_landmarks"], 1, MAX_LANDMARKS),
+            check_count("max_cycles", options["max_cycles"], 1, MAX_CYCLES),
         )
-        check_count("n_agents", setting.n_agents, 1, 16)
-        check_count("n_landmarks", setting.n_landmarks, 1, 256)
-        check_count("max_cycles", setting.max_cycles, 1, 1_000_000)
+        problems = []
+        for index, landmarks in enumerate(rows):
+            where = f"{folder / CONFIG_FILE}: training_problems[{index}]"
+            problems.append(Problem(setting.grid, landmarks).landmarks)
+            if len(problems[-1]) != setting.n_landmarks:
+                raise ValueError(
+                    f"must have {setting.n_landmarks} landmarks, got {len(problems[-1])}"
+                )
     except KeyError as error:
         raise ValueError(f"{where}: no entry {error}") from error
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {error}") from error
-    problems = []
-    for index, landmarks in enumerate(rows):
-        try:
-            cells = Problem(setting.grid, landmarks).landmarks
-        except ValueError as error:
-            raise ValueError(f"{where}: training_problems[{index}]: {error}") from error
-        if len(cells) != setting.n_landmarks:
-            raise ValueError(
-                f"{where}: training_problems[{index}]: must have {setting.n_landmarks} landmarks, "
-                f"got {len(cells)}"
-            )
-        problems.append(cells)
     return setting, problems
 
 
-def check_fits(spec: NetworkSpec, setting: Setting, folder: Path) -> None:
+def check_fits(policy: NetworkPolicy, setting: Setting, folder: Path) -> None:
     """Refuse a run whose config and weights tell of different tasks.
 
     Raises
     ------
     ValueError
-        If grid size, number of agents, landmarks or actions differ.
+        If the grid, or the number of agents, landmarks or actions differ.
     """
-    told = {
-        "n_cells": setting.grid.n_cells,
+    spec = policy.spec
+    for name, value in {
         "n_agents": setting.n_agents,
         "n_landmarks": setting.n_landmarks,
         "n_actions": N_ACTIONS,
-    }
-    for name, value in told.items():
-        if getattr(spec, name) != value:
+    }.items():
+        found = getattr(spec, name)
+        if found != value and name not in spec.any_size:
             raise ValueError(
-                f"{folder}: {name} is {value} by {CONFIG_FILE}, and {getattr(spec, name)} by the "
-                "weights"
+                f"{folder}: {name} is {value} by {CONFIG_FILE}, and {found} by the weights"
             )
-    if spec.grid and Grid.from_text(spec.grid) != setting.grid:
+    if policy.grid not in (None, setting.grid):
         raise ValueError(f"{folder}: the grid is another one by {CONFIG_FILE} than by the weights")

@@ -13,34 +13,20 @@ follow the learner's own policy: that is where its values will be used.
 """
 
 import math
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from baselines.networks import NetworkSpec, split_joint
+from baselines.replay.relabelled import RelabelledReward, draw_landmarks
 from baselines.replay.stored import Batch
 from baselines.runs.checkpoints import take
 from mapp_env import Grid
 from mapp_env.compiled import nogil_kernel
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.task import make_world
 
 UNKNOWN = -1
-
-
-class RelabelledReward(NamedTuple):
-    """The team reward (R6) of a state with any landmarks."""
-
-    distances: np.ndarray  # (C, C) float32 from a cell to a landmark, or (0, 0): -1 a step
-    scale: float  # what it is multiplied by, to keep values of the order of one
-
-
-def relabelled_reward(grid: Grid, reward: str, scale: float) -> RelabelledReward:
-    """Return what the rules give for any landmarks."""
-    if reward == "step":
-        return RelabelledReward(np.zeros((0, 0), np.float32), scale)
-    if reward == "geodesic":
-        return RelabelledReward(np.asarray(grid.distances, np.float32), scale)
-    steps = grid.manhattan_from(range(grid.n_cells))
-    return RelabelledReward(steps.astype(np.float32), scale)
 
 
 class ImaginedReplay:
@@ -50,8 +36,10 @@ class ImaginedReplay:
     ----------
     spec
         Numbers of agents, landmarks, actions and cells.
-    depot
-        Where episodes start.
+    grid
+        The grid; its walls are read by nothing but the rules.
+    actors
+        The agents whose moves are imagined, by default all.
     n_rows
         Episodes imagined side by side: the states of a batch.
     n_tried
@@ -72,37 +60,50 @@ class ImaginedReplay:
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("moves", "cells", "landmarks", "visited", "ages")
+    PRODUCT: ClassVar[Any] = np.float64  # of reward and scale: rewards' last bit depends on it
 
     def __init__(
         self,
         spec: NetworkSpec,
-        depot: int,
+        grid: Grid,
+        actors: list[int] | None = None,
+        *,
         n_rows: int,
-        n_tried: int,
-        temperature: float,
-        exploration: float,
+        n_tried: int = 1,
+        temperature: float = 1.0,
+        exploration: float = 0.0,
         from_depot: float,
         max_length: int,
         retries: float = 0.0,
     ) -> None:
-        self.spec, self.depot = spec, depot
-        self.n_tried = min(n_tried, spec.n_joint_actions)
+        n, k = spec.n_agents, spec.n_landmarks
+        self.spec, self.depot = spec, grid.depot
+        self.actors = list(range(n)) if actors is None else actors
+        n_joint = spec.n_actions ** len(self.actors)
+        self.digits = split_joint(np.arange(n_joint), len(self.actors), spec.n_actions)
+        self.n_tried = min(n_tried, n_joint)
         self.temperature, self.exploration = temperature, exploration
         self.from_depot, self.max_length, self.retries = from_depot, max_length, retries
-        n, k = spec.n_agents, spec.n_landmarks
+        self.world = make_world(grid, n, k)  # what the rules look up where no reward is asked for
         self.moves = np.full((spec.n_cells, spec.n_actions), UNKNOWN, np.int64)  # experienced
         self.cells = np.zeros((n_rows, n), np.int64)
         self.landmarks = np.zeros((n_rows, k), np.int64)
         self.visited = np.ones((n_rows, k), np.bool_)
         self.ages = np.full(n_rows, max_length, np.int64)  # of age: started anew when drawn
-        self.digits = split_joint(np.arange(spec.n_joint_actions), n, spec.n_actions)
 
-    def remember(
-        self, observation: np.ndarray, actions: np.ndarray, next_observation: np.ndarray
+    # -- experience
+
+    def add(
+        self,
+        observation: np.ndarray,
+        actions: np.ndarray,
+        reward: float,
+        next_observation: np.ndarray,
+        terminated: bool,
     ) -> None:
-        """Keep where each agent's move has led."""
-        n = self.spec.n_agents
-        self.moves[observation[:n].astype(np.int64), actions] = next_observation[:n]
+        """Keep where each actor's move has led."""
+        cells = observation[self.actors].astype(np.int64)
+        self.moves[cells, actions] = next_observation[self.actors]
 
     @property
     def ready(self) -> bool:
@@ -110,38 +111,75 @@ class ImaginedReplay:
         return len(self._known_cells()) >= self.spec.n_landmarks
 
     def _known_cells(self) -> np.ndarray:
-        """Return the cells that somebody has moved from, but for the depot."""
+        """Return the cells with recorded moves, but for the depot."""
         known = np.flatnonzero((self.moves != UNKNOWN).any(axis=1))
         return known[known != self.depot]
 
+    def known_actions(self, observations: np.ndarray) -> np.ndarray | None:
+        """Return which actions have been made from there, (..., N, A); None if it is all.
+
+        Where none has been made, all count as known: there is nothing else to go by.
+        """
+        unknown = self.moves == UNKNOWN
+        unknown[unknown.all(axis=1)] = False
+        if not unknown.any():
+            return None
+        return ~unknown[observations[..., self.actors].astype(np.int64)]
+
+    # -- imagination
+
     def observations(self) -> np.ndarray:
-        """Return the imagined states as global observations (rows, N + 2K) float32."""
-        return join(self.cells, self.landmarks, self.visited)
+        """Return the imagined states as the network is given them, (rows, D) float32."""
+        return self._observe(self.cells, self.landmarks, self.visited)
+
+    def _observe(self, cells: np.ndarray, landmarks: np.ndarray, visited: np.ndarray) -> np.ndarray:
+        """Return states (..., N), (..., K), (..., K) as the network is given them."""
+        return join(cells, landmarks, visited)
 
     def start_over(self, rng: np.random.Generator) -> np.ndarray:
         """Begin a new episode in each row that has ended; return these rows' numbers."""
-        solved = self.visited.all(axis=1)
-        ended = solved | (self.ages >= self.max_length)
-        count, k = int(ended.sum()), self.spec.n_landmarks
-        rows: np.ndarray = np.flatnonzero(ended)
+        solved, rows = self._ended()
+        count = len(rows)
         if count == 0:
             return rows
         known = self._known_cells()
         anywhere = np.append(known, self.depot)
         cells = anywhere[rng.integers(len(anywhere), size=(count, self.spec.n_agents))]
         at_depot = rng.random(count) < self.from_depot
-        landmarks = known[rng.random((count, len(known))).argpartition(k - 1, axis=1)[:, :k]]
-        again = ~solved[ended] & (rng.random(count) < self.retries)
-        landmarks[again], at_depot[again] = self.landmarks[ended][again], True
-        left = rng.integers(1, k + 1, size=count)
-        # All visited already: such a row starts at the depot as well.
-        visited = (np.arange(k) >= left[:, None]) | is_on(cells, landmarks)
-        at_depot |= visited.all(axis=1)
-        cells[at_depot] = self.depot
-        visited[at_depot] = False
-        self.cells[ended], self.landmarks[ended], self.visited[ended] = cells, landmarks, visited
-        self.ages[ended] = 0
+        landmarks = draw_landmarks(known, count, self.spec.n_landmarks, rng)
+        again = ~solved[rows] & (rng.random(count) < self.retries)
+        self._begin(rows, cells, landmarks, at_depot, again, rng)
         return rows
+
+    def _ended(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return which episodes are solved, (rows,) bool, and the numbers of all that are over."""
+        solved = self.visited.all(axis=1)
+        return solved, np.flatnonzero(solved | (self.ages >= self.max_length))
+
+    def _begin(
+        self,
+        rows: np.ndarray,
+        cells: np.ndarray,
+        landmarks: np.ndarray,
+        at_depot: np.ndarray,
+        again: np.ndarray,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        """Begin episodes in some rows; return which of them start at the depot.
+
+        Those `again` do so with the landmarks they had, and so do those that would start with
+        all landmarks visited.
+        """
+        k = self.spec.n_landmarks
+        landmarks[again] = self.landmarks[rows[again]]
+        left = rng.integers(1, k + 1, size=len(rows))
+        visited = np.arange(k) >= left[:, None]
+        visited, _, over = visit_rows(self.world, cells, landmarks, visited)
+        at_depot = at_depot | again | over
+        cells[at_depot], visited[at_depot] = self.depot, False
+        self.cells[rows], self.landmarks[rows], self.visited[rows] = cells, landmarks, visited
+        self.ages[rows] = 0
+        return at_depot
 
     def draw(
         self, values: np.ndarray, reward: RelabelledReward, rng: np.random.Generator
@@ -151,7 +189,8 @@ class ImaginedReplay:
         Parameters
         ----------
         values
-            (rows, A ** N) float32, what joint actions are worth in :meth:`observations`.
+            (rows, A ** N) float32, what the actors' joint actions are worth in
+            :meth:`observations`.
         reward
             How transitions are rewarded.
         rng
@@ -165,54 +204,50 @@ class ImaginedReplay:
             (rows,) which of the actions tried each episode goes on with.
         """
         n_rows = len(self.cells)
-        before = self.observations()
-        joint, cells, visited, rewards, done = try_actions(
-            self.cells,
-            self.landmarks,
-            self.visited,
-            values,
-            rng.random((n_rows, self.n_tried)),
-            self.temperature,
-            self.moves,
-            self.digits,
-            *reward,
-        )
+        own = self.cells[:, self.actors]
+        chances = rng.random((n_rows, self.n_tried))
+        joint = try_actions(own, values, chances, self.temperature, self.moves, self.digits)
+        actions = self.digits[joint]
+        # What the others do is the same whatever the actors try.
+        cells = np.repeat(self._others_move()[:, None], self.n_tried, axis=1)
+        cells[:, :, self.actors] = self.moves[own[:, None], actions]
+        landmarks = np.repeat(self.landmarks[:, None], self.n_tried, axis=1)
+        visited = np.repeat(self.visited[:, None], self.n_tried, axis=1)
+        parts = (part.reshape(-1, part.shape[-1]) for part in (cells, landmarks, visited))
+        arrived = visit_rows(reward.world, *parts)
+        visited, rewards, over = (part.reshape(n_rows, self.n_tried, -1) for part in arrived)
+        scaled = self.PRODUCT(reward.scale) * rewards.astype(self.PRODUCT)
         followed = np.where(
             rng.random(n_rows) < self.exploration, rng.integers(self.n_tried, size=n_rows), 0
         )
-        rows = np.arange(n_rows)
         batch = Batch(
-            observations=before,
-            actions=self.digits[joint],
-            rewards=rewards,
-            next_observations=join(cells, self.landmarks[:, None], visited),
-            terminated=done,
+            observations=self.observations(),
+            actions=actions,
+            rewards=scaled.astype(np.float32)[:, :, 0],
+            next_observations=self._observe(cells, landmarks, visited),
+            terminated=over[:, :, 0],
         )
+        rows = np.arange(n_rows)
         self.cells, self.visited = cells[rows, followed], visited[rows, followed]
-        # Where somebody has been but not moved from, the story ends.
-        stuck = (self.moves[self.cells] == UNKNOWN).all(axis=2).any(axis=1)
+        # An episode stops in a cell with no recorded moves.
+        stuck = (self.moves[self.cells[:, self.actors]] == UNKNOWN).all(axis=2).any(axis=1)
         self.ages = np.where(stuck, self.max_length, self.ages + 1)
         return batch, followed
+
+    def _others_move(self) -> np.ndarray:
+        """Return where all agents but the actors are after the next step, (rows, N)."""
+        return self.cells
 
     def follow(self, actions: np.ndarray) -> None:
         """Let the imagined episodes go on with joint actions (rows, N) whose moves are known."""
         self.cells = self.moves[self.cells, actions]
-        self.visited = self.visited | is_on(self.cells, self.landmarks)
+        self.visited, *_ = visit_rows(self.world, self.cells, self.landmarks, self.visited)
         self.ages += 1
 
-    def known_actions(self, observations: np.ndarray) -> np.ndarray | None:
-        """Return which actions somebody has made from there, (B, N, A); None if it is all.
-
-        Where nobody has made any, all count as known: there is nothing else to go by.
-        """
-        unknown = self.moves == UNKNOWN
-        unknown[unknown.all(axis=1)] = False
-        if not unknown.any():
-            return None
-        return ~unknown[observations[:, : self.spec.n_agents].astype(np.int64)]
+    # -- checkpoints
 
     def arrays_by_name(self) -> dict[str, np.ndarray]:
-        """Return all that changes, for a checkpoint."""
+        """Return all that changes."""
         return {name: getattr(self, name) for name in self.CHANGING}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -227,29 +262,16 @@ def join(cells: np.ndarray, landmarks: np.ndarray, visited: np.ndarray) -> np.nd
     return np.concatenate((cells, landmarks, visited), axis=-1).astype(np.float32)
 
 
-def is_on(cells: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
-    """Return which landmarks (B, K) an agent (B, N) stands on."""
-    on: np.ndarray = (landmarks[:, :, None] == cells[:, None, :]).any(axis=2)
-    return on
-
-
 @nogil_kernel
-def try_actions(
-    cells, landmarks, visited, values, chances, temperature, moves, digits, distances, scale
-):  # type: ignore[no-untyped-def]
-    """Return the joint actions tried in each state, and what each leads to.
+def try_actions(cells, values, chances, temperature, moves, digits):  # type: ignore[no-untyped-def]
+    """Return which joint actions are tried in each state, (rows, T) int64.
 
     Of the joint actions all of whose moves are known: the best, then draws from the others with
     probabilities proportional to ``exp(value / temperature)``.
     """
     n_rows, n_tried = chances.shape
     n_joint, n_agents = digits.shape
-    n_landmarks = landmarks.shape[1]
     joint = np.empty((n_rows, n_tried), np.int64)
-    next_cells = np.empty((n_rows, n_tried, n_agents), np.int64)
-    next_visited = np.empty((n_rows, n_tried, n_landmarks), np.bool_)
-    rewards = np.zeros((n_rows, n_tried), np.float32)
-    done = np.empty((n_rows, n_tried), np.bool_)
     weights = np.empty(n_joint)  # summed up
     for row in range(n_rows):
         best = -1
@@ -266,32 +288,10 @@ def try_actions(
                 total += math.exp((values[row, action] - values[row, best]) / temperature)
             weights[action] = total
         for tried in range(n_tried):
-            chosen = best
+            joint[row, tried] = best
             if tried > 0 and total > 0.0:
                 chosen = 0
                 while chosen < n_joint - 1 and weights[chosen] <= chances[row, tried] * total:
                     chosen += 1
-            joint[row, tried] = chosen
-            for agent in range(n_agents):
-                action = digits[chosen, agent]
-                next_cells[row, tried, agent] = moves[cells[row, agent], action]
-            left = 0
-            for k in range(n_landmarks):
-                there = visited[row, k]
-                for agent in range(n_agents):
-                    there |= next_cells[row, tried, agent] == landmarks[row, k]
-                next_visited[row, tried, k] = there
-                if there:
-                    continue
-                left += 1
-                if distances.shape[0]:
-                    nearest = np.float32(1e9)
-                    for agent in range(n_agents):
-                        cell = next_cells[row, tried, agent]
-                        nearest = min(nearest, distances[cell, landmarks[row, k]])
-                    rewards[row, tried] -= nearest
-            if left and not distances.shape[0]:
-                rewards[row, tried] = -1.0
-            rewards[row, tried] *= scale  # as the environment's reward is when it was stored
-            done[row, tried] = left == 0
-    return joint, next_cells, next_visited, rewards, done
+                joint[row, tried] = chosen
+    return joint

@@ -8,12 +8,12 @@ from mapp_env.validation import check_count
 
 
 class Batch(NamedTuple):
-    """Transitions; B states, T joint actions tried in each, D numbers an observation, N agents."""
+    """Transitions; B states, T actions tried in each, D numbers an observation, N who act."""
 
     observations: np.ndarray  # (B, D) float32
-    actions: np.ndarray  # (B, T, N) int64, one action per agent
-    rewards: np.ndarray  # (B, T) float32, the team reward
-    next_observations: np.ndarray  # (B, T, D) float32, what was seen before any reset
+    actions: np.ndarray  # (B, T, N) int64, one action for each that acts
+    rewards: np.ndarray  # (B, T) float32, the team reward, scaled
+    next_observations: np.ndarray  # (B, T, D) float32, before any reset
     terminated: np.ndarray  # (B, T) bool, True where no reward can follow; a time-out is not that
 
 
@@ -22,13 +22,29 @@ class ReplayMemory:
 
     Only ``terminated`` is kept of an episode's end: a time-out (truncation) says nothing about
     the state it stopped in, so the learner goes on from there (it bootstraps).
+
+    Parameters
+    ----------
+    capacity
+        Transitions that are kept.
+    observation_size, n_agents
+        Numbers in an observation, and in an action.
+    reward_scale
+        What the rewards of a batch are multiplied by.
+
+    Raises
+    ------
+    ValueError
+        If a size is invalid.
     """
 
-    def __init__(self, capacity: int, observation_size: int, n_agents: int) -> None:
+    def __init__(
+        self, capacity: int, observation_size: int, n_agents: int, reward_scale: float = 1.0
+    ) -> None:
         check_count("capacity", capacity, 1, 100_000_000)
         check_count("observation_size", observation_size, 1, 1_000_000)
         check_count("n_agents", n_agents, 1, 1_000)
-        self.capacity = capacity
+        self.capacity, self.reward_scale = capacity, reward_scale
         self.arrays = Batch(
             observations=np.zeros((capacity, observation_size), np.float32),
             actions=np.zeros((capacity, 1, n_agents), np.int64),
@@ -40,6 +56,11 @@ class ReplayMemory:
 
     def __len__(self) -> int:
         return min(self.n_added, self.capacity)
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to learn from."""
+        return self.n_added > 0
 
     def add(
         self,
@@ -70,10 +91,16 @@ class ReplayMemory:
         if len(self) == 0:
             raise ValueError("sample: the replay memory is empty, add a transition first")
         rows = rng.integers(len(self), size=batch_size)
-        return Batch(*(array[rows] for array in self.arrays))
+        batch = Batch(*(array[rows] for array in self.arrays))
+        return batch._replace(rewards=np.float32(self.reward_scale) * batch.rewards)
+
+    def known_actions(self, observations: np.ndarray) -> None:
+        """Return None: any action may be the next one."""
+
+    # -- checkpoints
 
     def arrays_by_name(self) -> dict[str, np.ndarray]:
-        """Return all that is stored, for a checkpoint."""
+        """Return all that is stored."""
         filled = {name: array[: len(self)] for name, array in self.arrays._asdict().items()}
         return {**filled, "n_added": np.array(self.n_added)}
 

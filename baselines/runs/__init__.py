@@ -1,1 +1,1 @@
-"""Run folders: files, checkpoints, studies of several runs."""
+"""What a training leaves behind: its folder, its checkpoints, and how it is stopped."""

@@ -17,12 +17,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import safetensors.numpy
+from safetensors import SafetensorError
 
-from baselines.runs.folder import CHECKPOINTS, METRICS_FILE, RunFolder, parse_json, read_metrics
-from mapp_env.files import make_folder, read_bytes, write_bytes
+from baselines.runs.folder import CHECKPOINTS, METRICS_FILE, RunFolder, read_metrics
+from mapp_env.files import make_folder, parse_json, read_bytes, write_bytes
 
 FORMAT = "mapp_env checkpoint"
-VERSION = 2
+VERSION = 3
 KEPT = 2
 MAX_ARRAYS_BYTES = 4 << 30
 MAX_STATE_BYTES = 64 << 20
@@ -41,41 +42,28 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be used; the message names the file and what is wrong."""
 
 
-class Resumable(Protocol):
+class Saved(Protocol):
+    """What a checkpoint holds."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return all arrays that change, by name."""
+
+    def state(self) -> dict[str, Any]:
+        """Return all else that changes, ready for JSON."""
+
+    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+        """Take over what the two above returned; a ValueError if something is not there."""
+
+
+class Resumable(Saved, Protocol):
     """A training that can be saved, and carried on."""
 
     @property
     def number(self) -> int:
         """How far it is: 0 at the start, and more at each checkpoint."""
-        ...
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays that change, by name."""
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
-        ...
-
-    def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what the two above returned.
-
-        Raises
-        ------
-        ValueError
-            If something that must be there is not.
-        """
-        ...
 
     def check_metrics(self, table: dict[str, list[float]]) -> None:
-        """Compare where it stands with its metrics.csv.
-
-        Raises
-        ------
-        ValueError
-            If they differ.
-        """
-        ...
+        """Raise a ValueError if metrics.csv tells of another point."""
 
 
 class Checkpoints:
@@ -149,7 +137,7 @@ class Checkpoints:
         path = self._path(number, "json")
         try:
             text = read_bytes(path, MAX_STATE_BYTES, "a checkpoint", ValueError)
-            record = parse_json(text)
+            record = parse_json(text, "its state", ValueError)
             if not isinstance(record, dict) or record.get("format") != FORMAT:
                 raise ValueError("not a checkpoint")
             if record.get("version") != VERSION or record.get("number") != number:
@@ -161,15 +149,12 @@ class Checkpoints:
             if record["config_sha256"] != self.config:
                 raise ValueError("belongs to a run with another config")
             state, arrays_sha256 = record["state"], record["arrays_sha256"]
-        except (ValueError, KeyError, RecursionError) as error:
-            raise CheckpointError(f"{path}: {error}") from error
-        path = self._path(number, "safetensors")
-        try:
+            path = self._path(number, "safetensors")
             content = read_bytes(path, MAX_ARRAYS_BYTES, "a checkpoint", ValueError)
             if _digest(content) != arrays_sha256:
                 raise ValueError("changed since it was written: its digest differs")
             arrays = safetensors.numpy.load(content)
-        except Exception as error:  # safetensors raises its own error type, a plain Exception
+        except (ValueError, KeyError, SafetensorError) as error:
             raise CheckpointError(f"{path}: {error}") from error
         return Checkpoint(number, arrays, state)
 
@@ -206,8 +191,13 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def joined(parts: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the arrays of all parts, each named after its part, a dot and its own name."""
+    return {f"{part}.{name}": array for part, own in parts.items() for name, array in own.items()}
+
+
 def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a name and a dot, without these."""
+    """Return one of the parts that :func:`joined` put together."""
     start = name + "."
     return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
 
@@ -240,19 +230,7 @@ def save(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> None:
 
 
 def go_on(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> bool:
-    """Bring a training to its newest whole checkpoint; leave it at its start if there was none.
-
-    Parameters
-    ----------
-    run, checkpoints
-        The run's folder and its checkpoints.
-    training
-        What is carried on, at its start.
-
-    Returns
-    -------
-    bool
-        Whether there was a checkpoint.
+    """Bring a training, at its start, to its newest whole checkpoint; return whether there is one.
 
     Raises
     ------
@@ -295,25 +273,16 @@ def check_restored(checkpoint: Checkpoint, training: Resumable) -> None:
         If the next checkpoint would not hold the same.
     """
     state = {**training.state(), "metrics": checkpoint.state["metrics"]}
-    arrays = training.arrays()
-    differing = [
-        name
-        for name in sorted(state.keys() | checkpoint.state.keys())
-        if _canonical({name: state.get(name)}) != _canonical({name: checkpoint.state.get(name)})
-    ]
-    differing += [
-        name
-        for name in sorted(arrays.keys() | checkpoint.arrays.keys())
-        if not _equal(arrays.get(name), checkpoint.arrays.get(name))
-    ]
-    if checkpoint.number != training.number:
-        differing.append("number")
+    saved = _entries(checkpoint)
+    found = _entries(Checkpoint(training.number, training.arrays(), state))
+    differing = sorted(k for k in saved.keys() | found.keys() if saved.get(k) != found.get(k))
     if differing:
         raise ValueError(f"it has not all of {', '.join(differing)}, or something else there")
 
 
-def _equal(one: np.ndarray | None, other: np.ndarray | None) -> bool:
-    if one is None or other is None:
-        return False
-    same = (one.dtype, one.shape) == (other.dtype, other.shape)
-    return same and one.tobytes() == other.tobytes()
+def _entries(checkpoint: Checkpoint) -> dict[str, object]:
+    """Return everything in a checkpoint by name, in a form that is equal only if all bits are."""
+    number, arrays, state = checkpoint
+    texts = {f"state {name}": _canonical({name: value}) for name, value in state.items()}
+    parts = {name: (a.dtype, a.shape, a.tobytes()) for name, a in arrays.items()}
+    return {"number": number, **texts, **parts}

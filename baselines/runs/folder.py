@@ -1,19 +1,17 @@
 """Run folders: what a training leaves behind, written so that a stopped run stays readable.
 
-A run folder holds
-
 =================== ==============================================================
 config.json         every option, the training problems, versions, commit
-metrics.csv         one row per finished episode; flushed at every row
-policy.safetensors  the network's weights (``policy.load_policy`` reads them)
+metrics.csv         a row per finished episode (of an imitation: per 100 updates)
+policy.safetensors  the network's weights (``policies.load_policy`` reads them)
 timing.json         where the time went; the only file with wall times of the run
 checkpoints/        the last two checkpoints (``checkpoints.Checkpoints``)
 evaluation.csv/.md  the table over unseen problems
 fig*.png            the paper's figures 2, 3 and 4
 =================== ==============================================================
 
-metrics.csv holds no wall time: two runs with one seed write the same bytes. Files are written by
-``mapp_env.files``: whole or not at all.
+metrics.csv holds no wall time: two runs with one seed write the same bytes. Each of its rows is
+handed to the operating system at once; all other files are written whole or not at all.
 """
 
 import contextlib
@@ -21,29 +19,21 @@ import csv
 import hashlib
 import json
 import os
-import platform
-import signal
-import subprocess
-import sys
-import threading
-import time
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
-from importlib import metadata
+from datetime import datetime
 from pathlib import Path
-from types import FrameType, TracebackType
 from typing import Any
 
 from filelock import FileLock, Timeout
 
-import mapp_env
+from baselines.runs.provenance import describe_environment
 from mapp_env.files import (
     UNFINISHED,
     make_folder,
     read_bytes,
+    read_json,
     remove_unfinished,
-    unique_fields,
-    write_bytes,
+    write_text,
 )
 
 try:
@@ -55,12 +45,11 @@ CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.csv"
 WEIGHTS_FILE = "policy.safetensors"
 TIMING_FILE = "timing.json"
+EVALUATION_FILE = "evaluation.csv"  # the last file that counts: with it a run is through
 CHECKPOINTS = "checkpoints"
 LOCK_FILE = ".lock"
 MAX_TEXT_BYTES = 64 * 1024 * 1024  # no file of ours comes near; refuse to read more
 MAX_HEADER_BYTES = 1024  # of metrics.csv
-
-VERSIONED = ("numpy", "numba", "torch", "gymnasium", "pettingzoo", "safetensors")
 
 
 class RunFolder:
@@ -97,39 +86,27 @@ class RunFolder:
             raise ValueError(
                 f"out must be a new or empty folder, got {str(folder)!r}, which is not empty"
             )
-        self._lock = FileLock(folder / LOCK_FILE)
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            raise ValueError(f"{folder}: another training is writing into it") from None
-        except OSError as error:
-            raise ValueError(f"{folder}: cannot be written into: {error}") from error
-        try:
-            self._open(resume)
-        except OSError as error:
-            self._lock.release()
-            raise ValueError(f"{folder}: cannot be written into: {error}") from error
-        except ValueError:
-            self._lock.release()
-            raise
+        with contextlib.ExitStack() as opened:
+            try:
+                opened.enter_context(FileLock(folder / LOCK_FILE).acquire(timeout=0))
+                self._metrics = opened.enter_context(
+                    self.path(METRICS_FILE).open(
+                        "r+" if resume else "a+", newline="", encoding="utf-8"
+                    )
+                )
+                self._lock_metrics()
+                self._writer = csv.writer(self._metrics, lineterminator="\n")
+                for place in filter(Path.is_dir, (folder, self.path(CHECKPOINTS))):
+                    remove_unfinished(place)  # what a killed training was about to write
+                if not resume:
+                    self.restart()
+            except Timeout:
+                raise ValueError(f"{folder}: another training is writing into it") from None
+            except OSError as error:
+                raise ValueError(f"{folder}: cannot be written into: {error}") from error
+            self._opened = opened.pop_all()
 
-    def _open(self, resume: bool) -> None:
-        """Open metrics.csv, and clear away what a killed training was about to write."""
-        mode = "r+" if resume else "a+"
-        self._metrics = self.path(METRICS_FILE).open(mode, newline="", encoding="utf-8")
-        self._writer = csv.writer(self._metrics, lineterminator="\n")
-        try:
-            self._hold()
-            for folder in (self.folder, self.path(CHECKPOINTS)):
-                if folder.is_dir():
-                    remove_unfinished(folder)
-            if not resume:
-                self.restart()
-        except BaseException:
-            self._metrics.close()
-            raise
-
-    def _hold(self) -> None:
+    def _lock_metrics(self) -> None:
         """Lock metrics.csv as well: of a lock file that was deleted others have another one."""
         if fcntl is None:
             return
@@ -140,8 +117,13 @@ class RunFolder:
         except OSError:  # a file system without such locks
             pass
 
+    def close(self) -> None:
+        """Close metrics.csv and release the folder."""
+        with contextlib.suppress(OSError):  # a row that has no room: that was said when it came
+            self._opened.close()
+
     def path(self, name: str) -> Path:
-        """Where the file called `name` is in this run."""
+        """Return where the file called `name` is in this run."""
         return self.folder / name
 
     def write_config(self, config: Mapping[str, Any]) -> None:
@@ -151,7 +133,9 @@ class RunFolder:
     def write_json(self, name: str, content: object) -> None:
         """Write a JSON file in one piece."""
         text = json.dumps(content, indent=2, allow_nan=False) + "\n"
-        write_bytes(self.path(name), text.encode(), MAX_TEXT_BYTES)
+        write_text(self.path(name), text, MAX_TEXT_BYTES)
+
+    # -- metrics.csv
 
     def log(self, row: Mapping[str, object]) -> None:
         """Append one row to metrics.csv and hand it to the operating system at once."""
@@ -175,7 +159,7 @@ class RunFolder:
         os.fsync(self._metrics.fileno())
         if not os.path.samestat(os.fstat(self._metrics.fileno()), path.stat()):
             raise ValueError(f"{path}: is no longer the file that this training writes")
-        content = read_metrics_file(self.folder)
+        content = read_bytes(path, MAX_TEXT_BYTES, "a metrics file", ValueError)
         return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
     def rows_at(self, position: Mapping[str, Any]) -> dict[str, list[float]]:
@@ -187,7 +171,8 @@ class RunFolder:
             If it has changed since.
         """
         path = self.path(METRICS_FILE)
-        content = read_metrics_file(self.folder)[: position["bytes"]]
+        content = read_bytes(path, MAX_TEXT_BYTES, "a metrics file", ValueError)
+        content = content[: position["bytes"]]
         if hashlib.sha256(content).hexdigest() != position["sha256"]:
             raise ValueError(f"{path}: changed since the checkpoint was written")
         return parse_metrics(path, content)
@@ -202,12 +187,6 @@ class RunFolder:
         self._metrics.seek(0)
         self._metrics.truncate(0)
         self._write_row(self.columns)
-
-    def close(self) -> None:
-        """Close metrics.csv and release the folder."""
-        with contextlib.suppress(OSError):  # a row that has no room: that was said when it came
-            self._metrics.close()
-        self._lock.release()
 
 
 def foreign_entry(folder: Path) -> str | None:
@@ -237,15 +216,12 @@ def read_config(folder: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If the file is missing, too large, not a JSON object, or has an entry twice.
+        If the file is missing, too large, or no object of strict JSON.
     """
     path = folder / CONFIG_FILE
-    try:
-        config = parse_json(read_bytes(path, MAX_TEXT_BYTES, "a config file", ValueError))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not a readable config: {error}") from error
+    config = read_json(path, MAX_TEXT_BYTES, "a config file", ValueError)
     if not isinstance(config, dict):
-        raise ValueError(f"{path}: not a readable config: it is not a JSON object")
+        raise ValueError(f"{path}: must hold a JSON object")
     return config
 
 
@@ -257,31 +233,21 @@ def read_metrics(folder: Path) -> dict[str, list[float]]:
     ValueError
         If the file is missing, too large, or not a table of numbers.
     """
-    return parse_metrics(folder / METRICS_FILE, read_metrics_file(folder))
-
-
-def read_metrics_file(folder: Path) -> bytes:
-    """Read a run's metrics.csv as it is.
-
-    Raises
-    ------
-    ValueError
-        If the file is missing or too large.
-    """
-    return read_bytes(folder / METRICS_FILE, MAX_TEXT_BYTES, "a metrics file", ValueError)
+    path = folder / METRICS_FILE
+    return parse_metrics(path, read_bytes(path, MAX_TEXT_BYTES, "a metrics file", ValueError))
 
 
 def parse_metrics(path: Path, content: bytes) -> dict[str, list[float]]:
     """Return the columns of a metrics.csv; as :func:`read_metrics`."""
     text = content.decode("utf-8", errors="replace")
-    lines = text[: text.rfind("\n") + 1].splitlines()
-    if not lines:
+    header, *lines = text[: text.rfind("\n") + 1].splitlines() or [""]
+    columns = header.split(",")
+    if not header:
         raise ValueError(f"{path}: no header line")
-    columns = lines[0].split(",")
     if len(set(columns)) != len(columns):
         raise ValueError(f"{path}, line 1: a column is there twice")
     table: dict[str, list[float]] = {column: [] for column in columns}
-    for number, line in enumerate(lines[1:], start=2):
+    for number, line in enumerate(lines, start=2):
         fields = line.split(",")
         if len(fields) != len(columns):
             raise ValueError(
@@ -293,110 +259,3 @@ def parse_metrics(path: Path, content: bytes) -> dict[str, list[float]]:
             except ValueError:
                 raise ValueError(f"{path}, line {number}: {column}: not a number") from None
     return table
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON, but refuse an entry that is there twice.
-
-    Raises
-    ------
-    ValueError
-        If it is no JSON, or has an entry twice.
-    RecursionError
-        If it is nested too deeply.
-    """
-    return json.loads(text, object_pairs_hook=unique_fields)
-
-
-def describe_environment() -> dict[str, Any]:
-    """Versions, commit, machine and command: what a reader needs to run this again."""
-    versions: dict[str, str | None] = {"python": platform.python_version()}
-    versions["mapp_env"] = mapp_env.__version__  # what runs, which need not be what is installed
-    for package in VERSIONED:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = None
-    return {
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": sys.argv,
-        "versions": versions,
-        "commit": git_commit(),
-        "platform": platform.platform(),
-        "cpu_count": os.cpu_count(),
-    }
-
-
-def git_commit() -> str | None:
-    """Return the commit these baselines are at, "+changes" if edited since; None without git."""
-    answers = []
-    for command in (["rev-parse", "HEAD"], ["status", "--porcelain"]):
-        try:
-            answer = subprocess.run(
-                ["git", *command],
-                cwd=Path(__file__).parent,
-                capture_output=True,
-                text=True,
-                timeout=10,
-                check=True,
-            )
-        except (OSError, subprocess.SubprocessError):
-            return None
-        answers.append(answer.stdout.strip())
-    return answers[0] + ("+changes" if answers[1] else "")
-
-
-class StopSignals:
-    """Turns Ctrl-C and SIGTERM into a question the training loop asks between two steps.
-
-    The first signal is only noted, so that weights and metrics are never caught half-way; a
-    second one interrupts as usual.
-    """
-
-    def __init__(self) -> None:
-        self.received: int | None = None
-        self._previous: dict[int, Any] = {}
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.received is not None:
-            raise KeyboardInterrupt
-        self.received = number
-
-    def __enter__(self) -> "StopSignals":
-        if threading.current_thread() is threading.main_thread():  # Python allows it only there
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-
-class Stopwatch:
-    """Adds up where the time goes: each lap is booked under a name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """Book the time since the last lap under `name`."""
-        now = time.perf_counter()
-        self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
-        self._last = now
-
-    @property
-    def total(self) -> float:
-        """Seconds of all laps, those before a resumption included."""
-        return sum(self.seconds.values())
-
-    def __str__(self) -> str:
-        total = max(self.total, 1e-9)
-        parts = [f"{name} {100 * s / total:.0f} %" for name, s in self.seconds.items()]
-        return f"{self.total:.1f} s: " + ", ".join(parts)

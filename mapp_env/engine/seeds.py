@@ -94,13 +94,15 @@ class RowSeeds:
 
     def next_words(self, indices: NDArray[np.int64]) -> NDArray[np.uint64]:
         """Return the next word of each row of ``indices``, shape (M,), as single draws would."""
-        used = self._used
-        for index in indices[used[indices] == WORDS_AHEAD]:
-            generator = self.generators[index]
-            self._words[index] = generator.integers(2**64, size=WORDS_AHEAD, dtype=np.uint64)
-            used[index] = 0
-        words: NDArray[np.uint64] = self._words[indices, used[indices]]
-        used[indices] += 1
+        used = self._used.take(indices)
+        spent = used == WORDS_AHEAD
+        if spent.any():
+            for index in indices[spent]:
+                generator = self.generators[index]
+                self._words[index] = generator.integers(2**64, size=WORDS_AHEAD, dtype=np.uint64)
+            used %= WORDS_AHEAD
+        words: NDArray[np.uint64] = self._words.take(indices * WORDS_AHEAD + used)
+        self._used[indices] = used + 1
         return words
 
 

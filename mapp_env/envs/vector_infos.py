@@ -73,11 +73,10 @@ def _add_metrics(infos: dict[str, Any], transition: Transition) -> None:
 
 def _add_finals(infos: dict[str, Any], transition: Transition, n_joint_actions: int) -> None:
     """Add the last observations and infos of the rows that ended."""
-    dones, ended, observations = transition.dones, transition.ended, transition.last_observations
+    dones, ended = transition.dones, transition.ended
     final_obs = np.empty(len(dones), dtype=object)  # of None
-    for index, observation in zip(ended.tolist(), observations, strict=True):
-        final_obs[index] = observation
-    action_mask = np.zeros_like(transition.masks)
+    final_obs[ended] = np.fromiter(transition.last_observations, object, len(ended))
+    action_mask = np.zeros(transition.masks.shape, np.int8)
     action_mask[ended] = transition.last_masks
     final_info = {"action_mask": action_mask, "_action_mask": dones.copy()}
     if n_joint_actions:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapp_env.engine.rules import WAIT
+from mapp_env.engine.state import WAIT
 from mapp_env.files import FileError
 from mapp_env.plans.replay import Episode, check_joint_actions, play_episode
 from mapp_env.plans.tours import check_tours, moves_of, tour_of, walk_tours

@@ -142,9 +142,9 @@ WITHOUT_A_PLACE = """
 import json, warnings
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
-    import mapp_env, baselines.networks.lookups
+    import mapp_env, baselines.networks.pairs
     grid = mapp_env.make_grid()
-    baselines.networks.lookups.routes(grid.moves[:1, None, :], grid.moves[:1], 49)
+    baselines.networks.pairs.routes(grid.moves[:1, None, :], grid.moves[:1], 49)
 from mapp_env import compiled
 assert compiled.is_compiled() and compiled.cache_folders() == compiled.cache_files() == []
 print(json.dumps([str(one.message) for one in told]))

@@ -32,7 +32,6 @@ NOT_RUN = {
     "python baselines/meta_dqn.py": "trains for minutes",
     "python baselines/independent_dqn.py": "trains for minutes",
     "python baselines/self_improve.py": "trains for an hour",
-    "python baselines/repair.py": "trains for minutes",
     "python baselines/export_playground.py": "plays the universe, or writes into the repository",
     "MAPP_PLAYGROUND_PROBLEMS=10000 python -m pytest": "is a longer part of this suite",
     "python examples/sb3_shared.py": "trains for a minute",
@@ -190,8 +189,8 @@ def read_by_script(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
             start(command, patch)
     taken = stopped.value.args[0]
     if isinstance(taken, tuple):  # a study, which hands what is not its own to every training
-        script = importlib.import_module(command.split()[1].removesuffix(".py").replace("/", "."))
-        getattr(script, "compare", script).plan_trials(*taken)
+        args, words = taken
+        args.plan(words)
 
 
 def read_installation(words: list[str]) -> None:

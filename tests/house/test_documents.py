@@ -251,7 +251,7 @@ def test_each_logged_metric_is_explained() -> None:
         rows for rows in tables(DOCS / "baselines.md") if rows[0] == ["entry", "unit", "what"]
     ]
     laps = set()
-    for name in ("training", "experiment"):
+    for name in ("training", "train"):
         source = (REPOSITORY / "baselines" / "learning" / f"{name}.py").read_text(encoding="utf-8")
         laps |= set(re.findall(r"\.lap\(\"([^\"]+)\"\)", source))
     assert len(laps) >= 5

@@ -20,7 +20,7 @@ import torch
 from playwright.sync_api import Browser, Page
 
 from baselines.export_playground import PLAYGROUND, export
-from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.networks import build_network, network_spec, torch_generator
 from baselines.policies.evaluation import evaluate
 from baselines.policies.policy import PRETRAINED, load_policy, save_policy
 from baselines.policies.settings import Setting
@@ -117,7 +117,9 @@ def test_page_acts_as_the_policy(name, visit, tmp_path):
 @pytest.mark.parametrize("name", ["pretrained", "pretrained-distilled"])
 def test_page_acts_as_the_rounded_policy(name, visit, tmp_path):
     """On as many problems as are asked for, with the same weights no action is another."""
-    save_policy(tmp_path / "policy.safetensors", load_policy(name).network, half_precision=True)
+    save_policy(
+        tmp_path / "policy.safetensors", load_policy(name).network, GRID, half_precision=True
+    )
     shutil.copy(PRETRAINED / name / "config.json", tmp_path)  # which grid they are for
     page = visit(folder=page_with(export(name), tmp_path / "page"))
     for part in np.array_split(problems(N_ROUNDED), -(-N_ROUNDED // 500)):
@@ -147,10 +149,10 @@ SPECS = {
 
 def make_policy(folder: Path, units: dict[str, Any]) -> Path:
     """Save a network with random weights as a run, in 16 bits."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 24, outputs="joint", code_units=7, **units)
+    spec = network_spec("pairs", 3, 5, 4, 49, 24, outputs="joint", code_units=7, **units)
     folder.mkdir()
     network = build_network(spec, torch_generator(np.random.SeedSequence(3)))
-    save_policy(folder / "policy.safetensors", network, half_precision=True)
+    save_policy(folder / "policy.safetensors", network, GRID, half_precision=True)
     options = {"n_agents": 3, "n_landmarks": 5, "max_cycles": 50}
     config = {"grid": GRID.to_text(), "options": options, "training_problems": []}
     (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
@@ -588,7 +590,7 @@ def test_small_weights_are_read(visit, tmp_path):
     with torch.no_grad():
         for weight in network.parameters():
             weight.mul_(2.0**-17)
-    save_policy(run / "policy.safetensors", network, half_precision=True)
+    save_policy(run / "policy.safetensors", network, GRID, half_precision=True)
     page = visit(folder=page_with(export(str(run)), tmp_path / "page"))
     seen = observations(20)
     rows = [[row[:3], row[3:8], row[8:]] for row in seen.astype(int).tolist()]

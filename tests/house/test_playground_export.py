@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from baselines.export_playground import COMMAND, PLAYGROUND, Args, export, kept_rows
-from baselines.networks import NetworkSpec, build_network, torch_generator
-from baselines.networks.lookups import arrange, between_landmarks, routes
+from baselines.networks import build_network, network_spec, torch_generator
+from baselines.networks.pairs import arrange, between_landmarks, routes
 from baselines.policies.policy import load_policy, save_policy
 from mapp_env import Grid, make_grid, make_vec
 from mapp_env.rendering import palette
 
 GRID = make_grid()
-PAIRS = {"kind": "pairs", "outputs": "joint", "code_units": 4}
+PAIRS = {"kind": "pairs", "outputs": "joint"}
 OPTIONS = {"n_agents": 3, "n_landmarks": 5, "max_cycles": 50}
 
 
@@ -26,12 +26,12 @@ def save_run(folder, grid=GRID, spec=None, large=None, **options):
     shape = (options["n_agents"], options["n_landmarks"], 4, grid.n_cells, 8)
     kind = {**PAIRS, **(spec or {})}
     network = build_network(
-        NetworkSpec(kind.pop("kind"), *shape, **kind), torch_generator(np.random.SeedSequence(0))
+        network_spec(kind.pop("kind"), *shape, **kind), torch_generator(np.random.SeedSequence(0))
     )
     if large is not None:
         with torch.no_grad():
             network.head.advantages.bias[0] = large
-    save_policy(folder / "policy.safetensors", network)
+    save_policy(folder / "policy.safetensors", network, grid)
     config = {"grid": grid.to_text(), "options": options, "training_problems": []}
     (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
     return str(folder)
@@ -63,7 +63,7 @@ def test_the_file_holds_the_rounded_weights():
 
 def test_kept_rows_are_those_looked_up():
     """Whatever random episodes look up is kept, and what no grid cell can mean is not."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 8, outputs="joint")
+    spec = network_spec("pairs", 3, 5, 4, 49, 8, outputs="joint")
     rows = kept_rows(spec, GRID)
     kept = {name: set(numbers.tolist()) for name, numbers in rows.items()}
     assert all(len(kept[name]) == len(numbers) for name, numbers in rows.items())

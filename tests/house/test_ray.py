@@ -16,7 +16,7 @@ import pytest
 from filelock import FileLock
 
 from baselines import compare
-from baselines.learning.study import MEASURES
+from baselines.learning.summary import MEASURES
 from baselines.runs.folder import LOCK_FILE
 
 pytest.importorskip("ray")

@@ -14,10 +14,9 @@ from baselines.independent_dqn import Args as IndependentArgs
 from baselines.independent_dqn import IndependentLearners
 from baselines.learning import q_learning as q_learner
 from baselines.learning.config import parse_options, preset_options, without_effect
-from baselines.learning.experiment import training_problems
-from baselines.learning.training import Streams, Training
+from baselines.learning.training import Streams, Training, training_problems
 from baselines.meta_dqn import Args, MetaLearner
-from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.networks import build_network, network_spec, torch_generator
 from baselines.policies.guidance import Guidance, GuidedPolicy, LinearSchedule
 from baselines.replay.stored import Batch, ReplayMemory
 from mapp_env import Grid, make_grid
@@ -34,8 +33,12 @@ def paper_learner(seed: int, n_agents: int, **changes: object) -> MetaLearner:
 
 
 def small_network(n_agents: int, seed: int, hidden_units: int = 64):
-    spec = NetworkSpec("paper", n_agents, 1, 4, 9, hidden_units)
+    spec = network_spec("paper", n_agents, 1, 4, 9, hidden_units)
     return build_network(spec, torch_generator(np.random.SeedSequence(seed)))
+
+
+def weights(network: torch.nn.Module) -> list[torch.Tensor]:
+    return [*network.parameters()]
 
 
 # -- targets -----------------------------------------------------------------------------------
@@ -68,7 +71,7 @@ def test_update_is_the_gradient_of_the_huber_loss_of_the_chosen_scores():
             rng.integers(0, 2, 4).astype(np.float32),
             rng.random() < 0.5,
         )
-    batch = learner.memory.sample(8, copy.deepcopy(learner.rng))
+    batch = learner.replay.sample(8, copy.deepcopy(learner.rng))
     network = copy.deepcopy(learner.network)
     with torch.no_grad():
         next_scores = learner.target(torch.from_numpy(batch.next_observations[:, 0])).numpy()
@@ -134,9 +137,9 @@ def fill(learner: MetaLearner) -> None:
     rng = np.random.default_rng(0)
     size = learner.spec.observation_size
     for _ in range(40):
-        observation, following = rng.integers(0, 2, (2, size)).astype(np.float32)
+        observation, next_obs = rng.integers(0, 2, (2, size)).astype(np.float32)
         actions = rng.integers(4, size=learner.spec.n_agents)
-        learner.remember(observation, actions, -1.0, following, False)
+        learner.remember(observation, actions, -1.0, next_obs, False)
 
 
 def test_step_size_rises_and_falls():
@@ -179,7 +182,7 @@ def test_target_network_starts_as_a_copy(preset):
     meta = MetaLearner(preset_options(Args, preset), SQUARE, Streams.spawn(0))
     team = IndependentLearners(preset_options(IndependentArgs, preset), SQUARE, Streams.spawn(0))
     for learner in (meta, *team.learners):
-        assert all(map(torch.equal, learner.target_weights, learner.weights))
+        assert all(map(torch.equal, weights(learner.target), weights(learner.network)))
 
 
 def test_target_network_is_copied_or_follows():
@@ -187,17 +190,19 @@ def test_target_network_is_copied_or_follows():
     learner = paper_learner(0, 1, batch_size=4, target_interval=3)
     fill(learner)
     for update in range(1, 8):
-        before = [tensor.clone() for tensor in learner.target_weights]
+        before = [tensor.clone() for tensor in weights(learner.target)]
         learner.update(0.0)
-        expected = learner.weights if update % 3 == 0 else before
-        assert all(map(torch.equal, learner.target_weights, expected))
-        assert not torch.equal(before[0], learner.weights[0])
+        expected = weights(learner.network) if update % 3 == 0 else before
+        assert all(map(torch.equal, weights(learner.target), expected))
+        assert not torch.equal(before[0], weights(learner.network)[0])
     learner = paper_learner(0, 1, batch_size=4, target_interval=0, target_rate=0.2)
     fill(learner)
     for _ in range(3):
-        before = [tensor.clone() for tensor in learner.target_weights]
+        before = [tensor.clone() for tensor in weights(learner.target)]
         learner.update(0.0)
-        for old, new, own in zip(before, learner.target_weights, learner.weights, strict=True):
+        for old, new, own in zip(
+            before, weights(learner.target), weights(learner.network), strict=True
+        ):
             torch.testing.assert_close(new, 0.8 * old + 0.2 * own.detach())
 
 
@@ -229,7 +234,7 @@ def test_imagined_goal_changes_when_it_is_said_to(gap):
                 np.array(here, np.float32), np.array([action]), 0.0, np.array(there), False
             )
     for progress, scale, discount in ((0.0, 0.1, 0.5), (0.39, 0.1, 0.5), (0.4, 0.333, 0.75)):
-        batch, targets = learner.prepare(progress)
+        batch, targets = learner.sample(progress)
         cells, landmarks = batch.next_observations[..., 0], batch.next_observations[..., 1]
         distances = abs(cells - landmarks)
         missing = distances if progress < 0.4 else (distances > 0).astype(np.float32)
@@ -238,8 +243,8 @@ def test_imagined_goal_changes_when_it_is_said_to(gap):
         np.testing.assert_allclose(batch.rewards, -scale * missing, rtol=1e-6)
         assert len(np.unique(batch.rewards)) > 1
         with torch.no_grad():
-            following = torch.from_numpy(batch.next_observations.reshape(-1, 3))
-            best = learner.target(following).max(dim=1).values.numpy().reshape(64, 4)
+            next_obs = torch.from_numpy(batch.next_observations.reshape(-1, 3))
+            best = learner.target(next_obs).max(dim=1).values.numpy().reshape(64, 4)
             here = learner.target(torch.from_numpy(batch.observations)).numpy()
         expected = batch.rewards + np.where(batch.terminated, 0.0, discount * best)
         taken = np.take_along_axis(here, batch.actions[:, :, 0], axis=1)
@@ -252,7 +257,7 @@ class Praising(torch.nn.Module):
 
     def __init__(self, network, learner):
         super().__init__()
-        self.network, self.moves, self.spec = network, learner.imagined.moves, learner.spec
+        self.network, self.moves, self.spec = network, learner.replay.moves, learner.spec
 
     def forward(self, observations):
         """Return the network's values, those of joint actions with such a move raised."""
@@ -283,11 +288,11 @@ def imagining(outputs, double, **others):
 def test_moves_that_nobody_has_made_are_worth_nothing(outputs, double, same):
     """Whatever a network thinks of them, they change no imagined transition and no target."""
     plain, praising = imagining(outputs, double), imagining(outputs, double)
-    assert (plain.imagined.moves < 0).any()
+    assert (plain.replay.moves < 0).any()
     praising.target = Praising(praising.target, praising)
     praising.network = Praising(praising.network, praising)
     for _ in range(12):
-        expected, found = plain.prepare(0.0), praising.prepare(0.0)
+        expected, found = plain.sample(0.0), praising.sample(0.0)
         same(tuple(found[0]), tuple(expected[0]))
         torch.testing.assert_close(found[1], expected[1])
 
@@ -301,7 +306,7 @@ def test_targets_are_the_target_networks_alone(outputs, replay, same):
         learner = imagining(outputs, False, replay=replay)
         other = MetaLearner(learner.args, SQUARE, Streams.spawn(start))
         learner.network.load_state_dict(other.network.state_dict())
-        prepared = [learner.prepare(0.0) for _ in range(4)]
+        prepared = [learner.sample(0.0) for _ in range(4)]
         batches.append([(*batch, targets.numpy()) for batch, targets in prepared])
     same(*batches)
 
@@ -310,14 +315,14 @@ def test_targets_are_the_target_networks_alone(outputs, replay, same):
 def test_double_dqn_in_imagination(outputs):
     """The next action is the trained network's choice, and its value the target network's."""
     learner = imagining(outputs, True, action_gap=0.0)
-    learner.imagined.moves[:] = SQUARE.moves
+    learner.replay.moves[:] = SQUARE.moves
     other = MetaLearner(learner.args, SQUARE, Streams.spawn(1))
     learner.target.load_state_dict(other.network.state_dict())
-    batch, targets = learner.prepare(0.0)
-    following = torch.from_numpy(batch.next_observations)
+    batch, targets = learner.sample(0.0)
+    next_obs = torch.from_numpy(batch.next_observations)
     with torch.no_grad():
         own, slow = (
-            network(following.flatten(0, 1)).unflatten(0, following.shape[:2])
+            network(next_obs.flatten(0, 1)).unflatten(0, next_obs.shape[:2])
             for network in (learner.network, learner.target)
         )
     assert (own.argmax(-1) != slow.argmax(-1)).any()  # so that it matters
@@ -514,19 +519,19 @@ def test_loop_stores_what_happened():
     while not training.finished:
         row = training.advance()
         rows += [row] if row else []
-    memory = learner.memory
+    memory = learner.replay
     stored = Batch(*(array[: len(memory)] for array in memory.arrays))
-    following, terminated = stored.next_observations[:, 0], stored.terminated[:, 0]
+    next_obs, terminated = stored.next_observations[:, 0], stored.terminated[:, 0]
     assert [row["episode"] for row in rows] == list(range(1, 25))
     assert training.now.steps == sum(row["steps"] for row in rows) == len(memory)
-    all_visited = following[:, -2:].all(axis=1)
+    all_visited = next_obs[:, -2:].all(axis=1)
     np.testing.assert_array_equal(terminated, all_visited)
     assert ((stored.rewards[:, 0] == 0) == all_visited).all()
     # Nothing is stored of the way from an episode's last state to the next one's first.
     begins = np.cumsum([0, *(row["steps"] for row in rows)])
     assert (stored.observations[begins[:-1], :3] == grid.depot).all()
     inside = np.setdiff1d(np.arange(1, len(memory)), begins)
-    np.testing.assert_array_equal(stored.observations[inside], following[inside - 1])
+    np.testing.assert_array_equal(stored.observations[inside], next_obs[inside - 1])
     starts = np.repeat(problems, 8, axis=0)
     np.testing.assert_array_equal(stored.observations[begins[:-1], 3:5], starts)
     ends = terminated[begins[1:] - 1]
@@ -534,7 +539,7 @@ def test_loop_stores_what_happened():
     assert 0 < all_visited.sum() == ends.sum() < 24  # both ends occur: visited, and out of time
     moves = np.asarray(grid.moves)
     np.testing.assert_array_equal(
-        moves[stored.observations[:, :3].astype(int), stored.actions[:, 0]], following[:, :3]
+        moves[stored.observations[:, :3].astype(int), stored.actions[:, 0]], next_obs[:, :3]
     )
 
 
@@ -722,13 +727,12 @@ def test_training_leaves_the_global_generators_alone(preset):
         ("final_reward", "more"),
         ("double", 1),
         ("dueling", "no"),
-        ("prefetch", 0),
         ("half_precision", "no"),
         ("weight_decay", -0.1),
         ("code_units", 0),
         ("learning_rate_warmup", -1),
         ("reward_scale", 0.0),
-        ("huber", 0.0),
+        ("huber_delta", 0.0),
         ("target_rate", 1.5),
         ("final_from", float("nan")),
         ("tried_actions", 0),
@@ -761,7 +765,6 @@ TINY = {
     "learning_starts": 8,
     "updates_per_episode": 3,
     "epsilon_end": 0.5,
-    "prefetch": False,
 }
 OTHERS = {
     "code_units": 5,
@@ -879,7 +882,6 @@ def small_training(preset, learner=MetaLearner, **changes):
         "code_units": 4,
         "batch_size": 4,
         "learning_starts": 10,
-        "prefetch": False,
     }
     args = preset_options(Args, preset, **{**options, **changes})
     grid = make_grid("paper-7x7")
@@ -1000,12 +1002,14 @@ def test_the_first_update_moves_the_weights():
         )
         learner.remember(before, actions, -1.0, after, False)
         cells = there
-    before = [weights.detach().clone() for weights in learner.weights]
+    before = [tensor.detach().clone() for tensor in weights(learner.network)]
     for _ in range(12):
         learner.update(0.0)
         rates.append(learner.optimiser.param_groups[0]["lr"])
         if len(rates) == 1:
-            assert any(not torch.equal(a, b) for a, b in zip(before, learner.weights, strict=True))
+            assert any(
+                not torch.equal(a, b) for a, b in zip(before, weights(learner.network), strict=True)
+            )
     rate = learner.args.learning_rate
     np.testing.assert_allclose(rates, [rate * min(1, (i + 1) / 10) for i in range(12)])
 

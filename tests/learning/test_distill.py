@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from baselines import (
-    distill,
-    independent_dqn,
-    meta_dqn,
-    repair,
-    self_improve,
-)
-from baselines.learning import imitation
+from baselines import distill, independent_dqn, meta_dqn, self_improve
+from baselines.learning import train
 from baselines.learning.config import parse_options
 from baselines.learning.exact_values import steps_left
 from baselines.policies.evaluation import Setting, evaluate, find_optima, unseen_problems
@@ -73,51 +67,51 @@ def test_labels_are_consistent_along_any_walk(n_agents, n_landmarks):
     for joint in range(4**n_agents):
         actions = np.array(np.unravel_index(joint, (4,) * n_agents))
         following = moves[cells, actions]
-        seen = visited | (landmarks[:, :, None] == following[:, None]).any(2)
-        left = steps_left(following, landmarks, seen, moves, distances).min(axis=1) + 1
-        np.testing.assert_array_equal(steps[:, joint], np.where(seen.all(axis=1), 0, left))
+        after = visited | (landmarks[:, :, None] == following[:, None]).any(2)
+        left = steps_left(following, landmarks, after, moves, distances).min(axis=1) + 1
+        np.testing.assert_array_equal(steps[:, joint], np.where(after.all(axis=1), 0, left))
 
 
 def test_wrong_answers_are_asked_again_until_they_are_right():
     """Just the states whose greedy action is not optimal wait, the oldest first, and come next."""
     args = distill.Args(**{**SMALL, "asked_again": 5})
-    pupil = distill.Distilled(args, make_grid())
+    distilled = distill.Distilled(args, make_grid())
     tables_of = tables(make_grid())
 
-    def wrong(seen: np.ndarray) -> np.ndarray:
-        cells, landmarks, flags = np.split(seen.astype(np.int64), (2, 4), axis=1)
+    def wrong(obs: np.ndarray) -> np.ndarray:
+        cells, landmarks, flags = np.split(obs.astype(np.int64), (2, 4), axis=1)
         steps = steps_left(cells, landmarks, flags > 0, *tables_of)
         with torch.inference_mode():
-            best = pupil.network(torch.from_numpy(seen)).argmax(1).numpy()
-        return steps[np.arange(len(seen)), best] > steps.min(axis=1)
+            best = distilled.network(torch.from_numpy(obs)).argmax(1).numpy()
+        return steps[np.arange(len(obs)), best] > steps.min(axis=1)
 
     for _ in range(5):
-        waiting = pupil.mistakes.copy()
-        pupil.lesson()  # and no step, so the network stays as it is
+        waiting = distilled.mistakes.copy()
+        distilled.batch_loss()  # and no step, so the network stays as it is
         stays = waiting[:5][wrong(waiting[:5])] if len(waiting) else waiting
         kept = len(waiting) - len(waiting[:5])
-        np.testing.assert_array_equal(pupil.mistakes[:kept], waiting[5:])
-        assert wrong(pupil.mistakes).all()
-        assert len(pupil.mistakes) >= kept + len(stays)
-    assert len(pupil.mistakes) > 50
-    for array in pupil.own_arrays()["mistakes"].values():
-        assert len(array) == len(pupil.mistakes)
+        np.testing.assert_array_equal(distilled.mistakes[:kept], waiting[5:])
+        assert wrong(distilled.mistakes).all()
+        assert len(distilled.mistakes) >= kept + len(stays)
+    assert len(distilled.mistakes) > 50
+    for array in distilled.own_arrays()["mistakes"].values():
+        assert len(array) == len(distilled.mistakes)
 
 
 @pytest.mark.parametrize("decay", [0.0, 0.3])
 def test_weights_decay_with_the_step_size(decay):
     """Vectors that are never looked up shrink by the step size times the decay, and only so."""
     args = distill.Args(**SMALL, weight_decay=decay, updates=4, learning_rate=0.5)
-    pupil = distill.Distilled(args, make_grid())
+    distilled = distill.Distilled(args, make_grid())
     wall = next(cell for cell in range(49) if make_grid().walls.flat[cell])
     row = wall * 51 + wall  # an agent in a wall, and a landmark there
-    start = pupil.network.pairs.weight[row].detach().clone()
+    start = distilled.network.pairs.weight[row].detach().clone()
     expected = start.clone()
     for update in range(4):
         rate = 0.5 * (1 - update / 4) * (update + 1) / 200  # it rises for 200 updates
         expected *= 1 - rate * decay
-        pupil.update()
-    torch.testing.assert_close(pupil.network.pairs.weight[row], expected, rtol=1e-6, atol=0.0)
+        distilled.advance()
+    torch.testing.assert_close(distilled.network.pairs.weight[row], expected, rtol=1e-6, atol=0.0)
     assert torch.equal(expected, start) == (decay == 0.0)
 
 
@@ -142,7 +136,7 @@ def test_few_problems_are_all_evaluated(tmp_path):
     assert "network alone,6," in (tmp_path / "run" / "evaluation.csv").read_text()
 
 
-def test_pupil_learns_the_optimum(tmp_path):
+def test_it_learns_the_optimum(tmp_path):
     """On a small grid a few hundred updates solve every problem, nearly all of them optimally."""
     (tmp_path / "grid.txt").write_text("....\n.#D.\n..#.\n....")
     args = distill.Args(
@@ -162,21 +156,21 @@ def test_stopped_and_resumed_is_the_same(tmp_path, monkeypatch):
     """Stopped by SIGTERM and resumed: the same bytes of metrics and weights."""
     options = {**SMALL, "updates": 250, "checkpoint_seconds": 1e9}
     assert distill.main(distill.Args(out=tmp_path / "whole", **options)) == 0
-    update, calls = distill.Distilled.update, []
+    advance, calls = distill.Distilled.advance, []
 
     def interrupted(self):
         calls.append(None)
         if len(calls) == 137:
             os.kill(os.getpid(), signal.SIGTERM)
-        return update(self)
+        return advance(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(distill.Distilled, "update", interrupted)
+        patch.setattr(distill.Distilled, "advance", interrupted)
         assert distill.main(distill.Args(out=tmp_path / "run", **options)) == 143
     assert distill.main(distill.Args(resume=tmp_path / "run")) == 0
     for name in ("metrics.csv", "policy.safetensors"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    with pytest.raises(ValueError, match="leave out all others"):
+    with pytest.raises(ValueError, match="leave out seed"):
         distill.main(distill.Args(resume=tmp_path / "run", seed=1))
 
 
@@ -186,16 +180,16 @@ def test_what_is_wrong_with_a_checkpoint_is_said(tmp_path, monkeypatch, forge):
     Before that a second signal ends the training at once.
     """
     folder = tmp_path / "run"
-    lesson, calls = distill.Distilled.lesson, []
+    batch_loss, calls = distill.Distilled.batch_loss, []
 
     def interrupted(self):
         calls.append(None)
         for _ in range({130: 1, 131: 2}.get(len(calls), 0)):
             os.kill(os.getpid(), signal.SIGTERM)
-        return lesson(self)
+        return batch_loss(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(distill.Distilled, "lesson", interrupted)
+        patch.setattr(distill.Distilled, "batch_loss", interrupted)
         options = {**SMALL, "updates": 250, "checkpoint_seconds": 1e9}
         assert distill.main(distill.Args(out=folder, **options)) == 143
         assert distill.main(distill.Args(resume=folder)) == 143
@@ -220,15 +214,28 @@ def test_what_is_wrong_with_a_checkpoint_is_said(tmp_path, monkeypatch, forge):
     assert len((folder / "metrics.csv").read_text().splitlines()) == 2
 
 
-@pytest.mark.parametrize("script", [distill, repair, self_improve, meta_dqn, independent_dqn])
+@pytest.mark.parametrize("script", [distill, self_improve, meta_dqn, independent_dqn])
 def test_a_resumed_run_takes_no_options(script, monkeypatch):
     """On the command line not even one with its default: the run may have another."""
     monkeypatch.setattr(sys, "argv", ["script", "--resume", "run", "--seed", "0"])
-    read = parse_options if hasattr(script.Args, "OUTPUTS") else imitation.parse_arguments
     with pytest.raises(ValueError, match=r"resume goes on with the run's own options.* seed$"):
-        read(script.Args, "")
+        parse_options(script.Args, "")
     monkeypatch.setattr(sys, "argv", ["script", "--resume", "run"])
-    assert read(script.Args, "").resume == Path("run")
+    assert parse_options(script.Args, "").resume == Path("run")
+
+
+@pytest.mark.parametrize(
+    ("script", "former", "name"),
+    [
+        (meta_dqn, "--huber", "huber_delta"),
+        (self_improve, "--sharpness", "inverse_temperature"),
+    ],
+)
+@pytest.mark.parametrize("words", ["{} 0.25", "{}=0.25"])
+def test_former_names_of_options_are_understood(script, former, name, words):
+    """Commands that were documented before an option was renamed still say the same."""
+    options = parse_options(script.Args, "", words.format(former).split())
+    assert getattr(options, name) == 0.25
 
 
 def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
@@ -248,13 +255,13 @@ def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
     further = {**options, "policy": str(first), "seed": 1}
     assert distill.main(distill.Args(out=tmp_path / "whole", **further)) == 0
 
-    def killed(pupil, *others):
-        for name, tensor in pupil.network.state_dict().items():
+    def killed(training, *others):
+        for name, tensor in training.network.state_dict().items():
             assert torch.equal(tensor, start[name])
         raise ZeroDivisionError
 
     with monkeypatch.context() as patch:
-        patch.setattr(imitation, "train", killed)
+        patch.setattr(train, "train", killed)
         with pytest.raises(ZeroDivisionError):
             distill.main(distill.Args(out=tmp_path / "run", **further))
     for path in first.glob("*.*"):
@@ -267,24 +274,24 @@ def test_it_goes_on_from_a_policy(tmp_path, monkeypatch):
 def test_too_many_mistakes_forget_the_oldest(monkeypatch):
     """Where more answers are wrong than may wait, those that have waited longest are dropped."""
     monkeypatch.setattr(distill, "MAX_MISTAKES", 30)
-    pupil = distill.Distilled(distill.Args(**{**SMALL, "asked_again": 5}), make_grid())
-    pupil.lesson()
+    distilled = distill.Distilled(distill.Args(**{**SMALL, "asked_again": 5}), make_grid())
+    distilled.batch_loss()
     for _ in range(3):
-        waiting = pupil.mistakes.copy()
+        waiting = distilled.mistakes.copy()
         assert len(waiting) == 30
-        pupil.lesson()
+        distilled.batch_loss()
         # Of a batch of 64 more than 30 answers are wrong, so that all that waits is new.
         old = {tuple(row) for row in waiting[5:].tolist()}
-        assert sum(tuple(row) in old for row in pupil.mistakes.tolist()) < 5
+        assert sum(tuple(row) in old for row in distilled.mistakes.tolist()) < 5
 
 
 def test_the_last_update_still_teaches():
     """The step size falls in a straight line, and reaches 0 only when all updates are done."""
-    pupil = distill.Distilled(distill.Args(**SMALL, updates=4, learning_rate=0.5), make_grid())
+    distilled = distill.Distilled(distill.Args(**SMALL, updates=4, learning_rate=0.5), make_grid())
     for _ in range(4):
-        before = [weights.detach().clone() for weights in pupil.network.parameters()]
-        pupil.update()
-        after = pupil.network.parameters()
+        before = [weights.detach().clone() for weights in distilled.network.parameters()]
+        distilled.advance()
+        after = distilled.network.parameters()
         assert any(not torch.equal(a, b) for a, b in zip(before, after, strict=True))
 
 
@@ -293,12 +300,12 @@ def test_a_run_starts_with_its_policys_own_weights(tmp_path, monkeypatch, half_p
     """What it may have to start from again is kept to the bit, however the end is kept."""
     kept = []
 
-    def noted(pupil, run, *others):
+    def noted(training, run, *others):
         start = load_policy(run.folder).network.state_dict()
-        kept.append([torch.equal(start[k], v) for k, v in pupil.network.state_dict().items()])
+        kept.append([torch.equal(start[k], v) for k, v in training.network.state_dict().items()])
         raise ZeroDivisionError
 
-    monkeypatch.setattr(imitation, "train", noted)
+    monkeypatch.setattr(train, "train", noted)
     args = distill.Args(out=tmp_path / "run", half_precision=half_precision, **SMALL)
     with pytest.raises(ZeroDivisionError):
         distill.main(args)

@@ -10,17 +10,24 @@ import torch
 from baselines.independent_dqn import Args, IndependentLearners
 from baselines.learning.config import preset_options
 from baselines.learning.training import Streams
-from baselines.networks import NetworkSpec, Team, build_network, torch_generator, view
-from baselines.policies.policy import WEIGHTS_KEY, load_policy, save_policy
+from baselines.networks import Team, build_network, network_spec, torch_generator, view
+from baselines.policies.policy import (
+    WEIGHTS_KEY,
+    NetworkPolicy,
+    header,
+    load_policy,
+    save_policy,
+)
 from baselines.policies.settings import Setting, check_fits
-from baselines.replay.imagined import RelabelledReward, relabelled_reward
-from baselines.replay.relabelled import RelabelledReplay
+from baselines.replay.relabelled import RelabelledReplay, relabelled_reward
 from mapp_env import Grid, make_grid, mapp_v0
 
 LEFT, RIGHT, UP, DOWN = range(4)
 GRID = make_grid("paper-7x7")
+ROWS, COLS = np.divmod(np.arange(49), 7)
+MANHATTAN = abs(ROWS[:, None] - ROWS) + abs(COLS[:, None] - COLS)
 IMAGINED, GEODESIC = {"replay": "imagined"}, {"network": "geodesic"}
-SMALL = {"hidden_units": 16, "code_units": 8, "batch_size": 16, "prefetch": False}
+SMALL = {"hidden_units": 16, "code_units": 8, "batch_size": 16}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -39,7 +46,6 @@ def make(preset: str, seed: int = 0, **changes: object) -> IndependentLearners:
 
 def walk(rng: np.random.Generator, n_steps: int):
     """Play at random by the rules; yield (observation, actions, reward, next, terminated)."""
-    table = relabelled_reward(GRID, "manhattan", 1.0).distances
     moves = np.asarray(GRID.moves)
     cells = np.full(3, GRID.depot)
     landmarks, visited = rng.choice(GRID.reachable, 5, replace=False), np.zeros(5, bool)
@@ -48,7 +54,7 @@ def walk(rng: np.random.Generator, n_steps: int):
         actions = rng.integers(4, size=3)
         cells = moves[cells, actions]
         visited = visited | np.isin(landmarks, cells)
-        reward = -sum(table[cells, mark].min() for mark in landmarks[~visited])
+        reward = -sum(MANHATTAN[cells, mark].min() for mark in landmarks[~visited])
         after = np.concatenate([cells, landmarks, visited]).astype(np.float32)
         yield before, actions, float(reward), after, bool(visited.all())
         if visited.all():
@@ -112,32 +118,31 @@ def test_shared_parameters(preset):
     """One network learns from all agents, each by its own cell first and its own place."""
     team = make(preset, share_parameters=True)
     assert len(team.learners) == len(team.network.members) == 1
-    seen = np.array([1, 2, 3, 10, 11, 12, 13, 14, 0, 1, 0, 1, 0], np.float32)
-    assert view(seen, 0, team.spec).tolist() == [*seen.tolist(), 1, 0, 0]
-    assert view(seen, 2, team.spec)[:3].tolist() == [3, 1, 2]
-    assert view(seen, 2, team.spec)[3:].tolist() == [*seen[3:].tolist(), 0, 0, 1]
+    obs = np.array([1, 2, 3, 10, 11, 12, 13, 14, 0, 1, 0, 1, 0], np.float32)
+    assert view(obs, 0, team.spec).tolist() == [*obs.tolist(), 1, 0, 0]
+    assert view(obs, 2, team.spec)[:3].tolist() == [3, 1, 2]
+    assert view(obs, 2, team.spec)[3:].tolist() == [*obs[3:].tolist(), 0, 0, 1]
     transition = next(walk(np.random.default_rng(0), 1))
     team.remember(*transition)
     replay = team.learners[0].replay
-    memory = getattr(replay, "memory", replay)
-    assert len(memory) == 3
-    assert memory.arrays.actions[:3, 0, 0].tolist() == transition[1].tolist()
+    assert len(replay) == 3
+    assert replay.arrays.actions[:3, 0, 0].tolist() == transition[1].tolist()
     for agent in range(3):
-        stored = memory.arrays.observations[agent]
+        stored = replay.arrays.observations[agent]
         np.testing.assert_array_equal(stored, view(transition[0], agent, team.spec))
-        following = memory.arrays.next_observations[agent, 0]
-        np.testing.assert_array_equal(following, view(transition[3], agent, team.spec))
+        next_obs = replay.arrays.next_observations[agent, 0]
+        np.testing.assert_array_equal(next_obs, view(transition[3], agent, team.spec))
 
 
 @pytest.mark.parametrize("kind", ["paper", "pairs"])
 @pytest.mark.parametrize("team", ["independent", "shared"])
 def test_agents_on_one_cell_can_part(kind, team):
     """Where all stand on the depot each agent has values of its own."""
-    spec = NetworkSpec(kind, 3, 5, 4, 49, 16, team=team)
+    spec = network_spec(kind, 3, 5, 4, 49, 16, team=team)
     network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
-    seen = torch.tensor([[24.0, 24, 24, 0, 6, 20, 42, 48, 0, 0, 0, 0, 0]])
+    obs = torch.tensor([[24.0, 24, 24, 0, 6, 20, 42, 48, 0, 0, 0, 0, 0]])
     with torch.no_grad():
-        values = network(seen)
+        values = network(obs)
     assert values.shape == (1, 3, 4)
     assert not torch.allclose(values[0, 0], values[0, 1])
     assert not torch.allclose(values[0, 1], values[0, 2])
@@ -187,10 +192,10 @@ def test_team_reward_teaches_each_agent_its_own_action(seed):
     rng = np.random.default_rng(seed)
     for _ in range(1500):
         flag = rng.integers(2)
-        seen = np.array([0, 0, 24, flag], np.float32)
+        obs = np.array([0, 0, 24, flag], np.float32)
         actions = rng.integers(4, size=2)
         good = [RIGHT, UP] if flag else [LEFT, DOWN]
-        team.remember(seen, actions, float((actions == good).sum()), seen, True)
+        team.remember(obs, actions, float((actions == good).sum()), obs, True)
     for _ in range(500):
         team.update(0.0)
     greedy = [team.act(np.array([0, 0, 24, flag], np.float32)).tolist() for flag in (0, 1)]
@@ -212,8 +217,9 @@ def test_no_target_is_above_what_the_rules_can_bring(share, gap):
         for height in (100.0, -100.0):
             with torch.no_grad():
                 learner.target.head.advantages.bias.fill_(height)
-            batch, targets = learner.prepare(0.0)
+            batch, targets = learner.sample(0.0)
             assert (targets <= 0).all()
+            targets = targets[..., 0]
             with torch.no_grad():
                 best = learner.target(torch.from_numpy(batch.next_observations[:, 0]))[:, 0]
                 here = learner.target(torch.from_numpy(batch.observations))[:, 0].numpy()
@@ -236,14 +242,14 @@ def test_targets_look_ahead_as_far_as_is_said(double, progress, discount):
         learner.target.load_state_dict(slow.network.state_dict())
         with torch.no_grad():
             learner.target.head.value.bias.fill_(-5.0)  # below what the rules can bring
-        batch, targets = learner.prepare(progress)
-        following = torch.from_numpy(batch.next_observations[:, 0])
+        batch, targets = learner.sample(progress)
+        next_obs = torch.from_numpy(batch.next_observations[:, 0])
         with torch.no_grad():
-            own, values = learner.network(following)[:, 0], learner.target(following)[:, 0]
+            own, values = learner.network(next_obs)[:, 0], learner.target(next_obs)[:, 0]
         assert (own.argmax(1) != values.argmax(1)).any()
         chosen = (own if double else values).argmax(1, keepdim=True)
         follows = discount * values.gather(1, chosen).numpy() * ~batch.terminated
-        np.testing.assert_allclose(targets, batch.rewards + follows, rtol=1e-5)
+        np.testing.assert_allclose(targets[..., 0], batch.rewards + follows, rtol=1e-5)
 
 
 @pytest.mark.parametrize("network", ["pairs", "geodesic"])
@@ -264,8 +270,8 @@ def test_targets_of_own_imagined_moves(network, gap):
     for agent, learner in enumerate(team.learners):
         made[agent][~made[agent].any(axis=1)] = True  # nothing else to go by
         for _ in range(3):
-            batch, targets = learner.prepare(0.0)
-            assert targets.shape == batch.actions.shape[:2] == (16, 2)
+            batch, targets = learner.sample(0.0)
+            assert targets.shape == batch.actions.shape == (16, 2, 1)
             with torch.no_grad():
                 here = learner.target(torch.from_numpy(batch.observations))[:, 0].numpy()
                 flat = torch.from_numpy(batch.next_observations.reshape(32, -1))
@@ -278,7 +284,7 @@ def test_targets_of_own_imagined_moves(network, gap):
             taken = np.take_along_axis(here, batch.actions[:, :, 0], axis=1)
             short = np.where(known, here, -np.inf).max(axis=1, keepdims=True) - taken
             expected = batch.rewards + going_on - gap * short
-            np.testing.assert_allclose(targets, expected, rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(targets[..., 0], expected, rtol=1e-5, atol=1e-5)
     assert n_unknown > 0
 
 
@@ -288,22 +294,22 @@ def test_targets_of_own_imagined_moves(network, gap):
 @pytest.mark.parametrize("reward", ["manhattan", "geodesic", "step"])
 def test_relabelled_transitions_obey_the_rules(reward):
     """Moves are those that were made; flags, reward and end are those of the landmarks given."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    spec = network_spec("pairs", 3, 5, 4, 49, 16, team="independent")
     replay = RelabelledReplay(spec, GRID.depot, 1000, fresh=0.8, as_far=0.5)
     stored, own = set(), set()
     for before, actions, _, after, _ in walk(np.random.default_rng(0), 1200):
-        replay.remember(before, actions[0], after)
-    kept = replay.memory.arrays
+        replay.add(before, actions[:1], np.nan, after, None)
+    kept = replay.arrays
     for before, action, after in zip(
         kept.observations, kept.actions[:, 0, 0], kept.next_observations[:, 0], strict=True
     ):
         stored.add((*before[:3], action, *after[:3]))
         own.add(tuple(before[3:8]))
     assert replay.ready
-    batch = replay.draw(2000, relabelled_reward(GRID, reward, 0.5), np.random.default_rng(1))
-    rows, cols = np.divmod(np.arange(49), 7)
-    manhattan = abs(rows[:, None] - rows) + abs(cols[:, None] - cols)
-    distances = manhattan if reward == "manhattan" else np.asarray(GRID.distances)
+    batch = replay.relabel(
+        2000, relabelled_reward(GRID, 3, 5, reward, 0.5), np.random.default_rng(1)
+    )
+    distances = MANHATTAN if reward == "manhattan" else np.asarray(GRID.distances)
     kept_own = 0
     for row in range(2000):
         before, after = batch.observations[row], batch.next_observations[row, 0]
@@ -333,13 +339,13 @@ def test_relabelled_transitions_obey_the_rules(reward):
 
 def test_drawing_leaves_what_was_experienced_alone():
     """Relabelling changes copies; equal generators draw equal batches."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    spec = network_spec("pairs", 3, 5, 4, 49, 16, team="independent")
     replay = RelabelledReplay(spec, GRID.depot, 300, fresh=1.0, as_far=0.5)
     for before, actions, _, after, _ in walk(np.random.default_rng(0), 200):
-        replay.remember(before, actions[0], after)
+        replay.add(before, actions[:1], np.nan, after, None)
     kept = {name: array.copy() for name, array in replay.arrays_by_name().items()}
-    reward = RelabelledReward(np.zeros((0, 0), np.float32), 1.0)
-    first, second = (replay.draw(50, reward, np.random.default_rng(3)) for _ in range(2))
+    reward = relabelled_reward(GRID, 3, 5, "step")
+    first, second = (replay.relabel(50, reward, np.random.default_rng(3)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
     for name, array in replay.arrays_by_name().items():
@@ -382,37 +388,39 @@ def test_a_network_sees_the_geodesic_observation(team, size):
     """Each agent's network makes of the global observation what the env shows that agent."""
     grid = make_grid("random", rows=6, cols=9, density=0.2, seed=3)
     n_agents, n_landmarks = size
-    spec = NetworkSpec("geodesic", n_agents, n_landmarks, 4, 54, 16, team=team, grid=grid.to_text())
+    spec = network_spec(
+        "geodesic", n_agents, n_landmarks, 4, 54, 16, team=team, grid=grid.to_text()
+    )
     members = build_network(spec).members
     env = mapp_v0.parallel_env(
         grid=grid, n_agents=n_agents, n_landmarks=n_landmarks, observation="geodesic"
     )
     rng = np.random.default_rng(0)
     for seed in range(3):
-        seen, _ = env.reset(seed=seed)
+        obs, _ = env.reset(seed=seed)
         while env.agents:
             for agent, name in enumerate(env.agents):
                 given = view(env.state()[None], agent, spec)
-                found = members[agent % len(members)].paths(given)
-                np.testing.assert_array_equal(found.ravel(), seen[name])
+                (found,) = members[agent % len(members)].paths(given)
+                np.testing.assert_array_equal(found.ravel(), obs[name])
             actions = rng.integers(4, size=n_agents).tolist()
-            seen, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
+            obs, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
 
 
 def test_landmarks_are_a_set_to_the_geodesic_network():
     """To rename landmarks changes nothing, nor does it matter where the visited ones stand."""
-    spec = NetworkSpec("geodesic", 3, 5, 4, 49, 16, team="independent", grid=GRID.to_text())
+    spec = network_spec("geodesic", 3, 5, 4, 49, 16, team="independent", grid=GRID.to_text())
     network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
-    seen, rng = observations(40), np.random.default_rng(1)
-    seen[:, :8] = rng.choice(GRID.reachable, (40, 8))
-    renamed, moved = seen.copy(), seen.copy()
+    obs, rng = observations(40), np.random.default_rng(1)
+    obs[:, :8] = rng.choice(GRID.reachable, (40, 8))
+    renamed, moved = obs.copy(), obs.copy()
     for row in range(40):
         order = rng.permutation(5)
-        renamed[row, 3:8], renamed[row, 8:] = seen[row, 3:8][order], seen[row, 8:][order]
-        visited = seen[row, 8:] > 0
+        renamed[row, 3:8], renamed[row, 8:] = obs[row, 3:8][order], obs[row, 8:][order]
+        visited = obs[row, 8:] > 0
         moved[row, 3:8][visited] = rng.choice(GRID.reachable, visited.sum())
     with torch.no_grad():
-        values, *others = (network(torch.from_numpy(x)) for x in (seen, renamed, moved))
+        values, *others = (network(torch.from_numpy(x)) for x in (obs, renamed, moved))
     for other in others:
         torch.testing.assert_close(values, other)
     assert len({tuple(row) for row in values[:, 0].tolist()}) > 30
@@ -422,61 +430,44 @@ def test_landmarks_are_a_set_to_the_geodesic_network():
     ("changes", "message"),
     [
         ({"grid": ""}, "grid must be a map, got ''"),
-        ({"grid": "D..\n..."}, "grid must have n_cells=49 cells, got 6"),
+        ({"grid": "D..\n..."}, "grid must have the network's 49 cells, got one of 6"),
         ({"n_cells": 5000}, "n_cells must be an integer in 2..4096, got 5000"),
         ({"team": "one"}, "team must be one of 'independent', 'shared'; got 'one'"),
-        ({"kind": "pairs"}, "grid must be '' for kind 'pairs', got"),
     ],
 )
 def test_a_network_on_paths_carries_its_grid(changes, message):
-    """The grid is that of the weights, and only that of a network that needs one."""
+    """It has the network's number of cells, and paths for each agent by itself."""
     right = {"kind": "geodesic", "team": "independent", "grid": GRID.to_text()}
     with pytest.raises(ValueError, match=message):
-        NetworkSpec(**{**right, "n_agents": 3, "n_landmarks": 5, "n_actions": 4, "n_cells": 49,
+        network_spec(**{**right, "n_agents": 3, "n_landmarks": 5, "n_actions": 4, "n_cells": 49,
                        "hidden_units": 8, **changes})  # fmt: skip
 
 
 def test_only_a_network_on_paths_says_its_grid():
-    """What is saved with any other network is what it was before there were such."""
+    """Any other network has no such field."""
     assert "grid" not in make("default").spec.as_dict()
+    with pytest.raises(TypeError, match="grid"):
+        network_spec("pairs", 3, 5, 4, 49, 8, grid=GRID.to_text())
     spec = make("default", **GEODESIC).spec
-    assert NetworkSpec(**spec.as_dict()) == spec
+    assert network_spec(**spec.as_dict()) == spec
 
 
 def test_a_run_on_another_grid_than_its_weights_is_refused(tmp_path):
     """Walls elsewhere, with as many cells: the paths would be wrong."""
-    spec = make("default", **GEODESIC).spec
-    check_fits(spec, Setting(GRID), tmp_path)
+    policy = NetworkPolicy(make("default", **GEODESIC).network, GRID)
+    check_fits(policy, Setting(GRID), tmp_path)
     text = GRID.to_text().replace("#", ".", 1)
     with pytest.raises(ValueError, match="the grid is another one"):
-        check_fits(spec, Setting(Grid.from_text(text)), tmp_path)
+        check_fits(policy, Setting(Grid.from_text(text)), tmp_path)
 
 
 # -- saved teams -------------------------------------------------------------------------------
-
-
-SPECS = [
-    NetworkSpec(kind, 3, 5, 4, 49, 16, dueling=dueling, code_units=8, team=team)
-    for kind in ("paper", "pairs")
-    for team in ("one", "independent", "shared")
-    for dueling in (False, True)
-] + [
-    NetworkSpec("geodesic", 3, 5, 4, 49, 16, code_units=8, team=team, grid=GRID.to_text())
-    for team in ("independent", "shared")
-]
 
 
 def observations(n: int) -> np.ndarray:
     rng = np.random.default_rng(0)
     cells, flags = rng.integers(49, size=(n, 8)), rng.integers(2, size=(n, 5))
     return np.concatenate([cells, flags], axis=1).astype(np.float32)
-
-
-@pytest.mark.parametrize("spec", SPECS, ids=lambda s: f"{s.kind}-{s.team}-{s.dueling}")
-def test_spec_counts_the_weights(spec):
-    """The number that is capped is the number there is, and each network counts once."""
-    network = build_network(spec)
-    assert spec.n_weights == sum(weights.numel() for weights in network.parameters())
 
 
 @pytest.mark.parametrize(
@@ -486,18 +477,18 @@ def test_spec_counts_the_weights(spec):
 def test_loaded_team_acts_as_the_learners_do(tmp_path, preset, changes, share):
     """One file holds the networks of all agents, and gives the same actions."""
     team = make(preset, share_parameters=share, **changes)
-    save_policy(tmp_path / "policy.safetensors", team.policy().network)
+    save_policy(tmp_path / "policy.safetensors", team.policy().network, GRID)
     loaded = load_policy(tmp_path)
     assert loaded.spec == team.spec
     assert isinstance(loaded.network, Team)
-    seen = observations(50)
-    actions = loaded.act(seen)
+    obs = observations(50)
+    actions = loaded.act(obs)
     assert actions.shape == (50, 3)
-    np.testing.assert_array_equal(actions, [team.act(row) for row in seen])
+    np.testing.assert_array_equal(actions, [team.act(row) for row in obs])
     with torch.no_grad():
         for agent, member in enumerate(team.network.members):
             if not share and not changes:
-                own = member(torch.from_numpy(seen))[:, 0].argmax(dim=1).numpy()
+                own = member(torch.from_numpy(obs))[:, 0].argmax(dim=1).numpy()
                 np.testing.assert_array_equal(actions[:, agent], own)
 
 
@@ -505,11 +496,11 @@ def test_damaged_teams_are_refused_by_name(tmp_path):
     """A member that is missing, too many, of another shape or not finite is named."""
     team = make("paper").policy().network
     good = {name: tensor.clone() for name, tensor in team.state_dict().items()}
-    about = {"version": 1, **team.spec.as_dict()}
+    about = header(team.spec, GRID)
     path = tmp_path / "w"
 
     def write(tensors, **changes):
-        text = json.dumps({**about, **changes})
+        text = json.dumps({**about, "network": {**about["network"], **changes}})
         path.write_bytes(safetensors.torch.save(tensors, {WEIGHTS_KEY: text}))
 
     write({**good, "members.1.layers.0.bias": torch.full((16,), float("nan"))})
@@ -537,21 +528,10 @@ def test_damaged_teams_are_refused_by_name(tmp_path):
         load_policy(path)
 
 
-def test_weights_without_a_team_are_of_one_network(tmp_path):
-    """Files written before there were teams are read as they were meant."""
-    spec = NetworkSpec("paper", 3, 5, 4, 49, 16)
-    network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
-    about = {"version": 1, **spec.as_dict()}
-    del about["team"]
-    content = safetensors.torch.save(network.state_dict(), {WEIGHTS_KEY: json.dumps(about)})
-    (tmp_path / "w").write_bytes(content)
-    assert load_policy(tmp_path / "w").spec == spec
-
-
 @pytest.mark.parametrize("as_far", [0.0, 0.2, 1.0])
 def test_share_of_fresh_landmarks_visited_as_far(as_far):
     """As many are visited as were in just that share of what is drawn; else any number may be."""
-    spec = NetworkSpec("pairs", 3, 5, 4, 49, 16, team="independent")
+    spec = network_spec("pairs", 3, 5, 4, 49, 16, team="independent")
     replay = RelabelledReplay(spec, GRID.depot, 400, fresh=1.0, as_far=as_far)
     moves = np.asarray(GRID.moves)
     rng, cells = np.random.default_rng(0), np.full(3, GRID.depot)
@@ -560,12 +540,12 @@ def test_share_of_fresh_landmarks_visited_as_far(as_far):
         actions = rng.integers(4, size=3)
         there = moves[cells, actions]
         before, after = (np.array([*c, *marks], np.float32) for c in (cells, there))
-        replay.remember(before, actions[0], after)
+        replay.add(before, actions[:1], np.nan, after, None)
         cells = there
-    batch = replay.draw(4000, RelabelledReward(np.zeros((0, 0), np.float32), 1.0), rng)
-    seen = batch.observations
-    on = (seen[:, None, :3] == seen[:, 3:8, None]).any(axis=2)
-    more = (seen[:, 8:] > on).any(axis=1)  # visited, though nobody stands on it
+    batch = replay.relabel(4000, relabelled_reward(GRID, 3, 5, "step"), rng)
+    obs = batch.observations
+    on = (obs[:, None, :3] == obs[:, 3:8, None]).any(axis=2)
+    more = (obs[:, 8:] > on).any(axis=1)  # visited, though nobody stands on it
     assert more.mean() == pytest.approx((1 - as_far) * 0.8, abs=0.05)
 
 
@@ -576,10 +556,7 @@ def test_as_much_is_kept_of_each_agent(preset, share):
     team = make(preset, share_parameters=share, memory_size=50)
     for transition in walk(np.random.default_rng(0), 80):
         team.remember(*transition)
-    capacities = []
-    for learner in team.learners:
-        memory = getattr(learner.replay, "memory", learner.replay)
-        capacities.append(len(memory))
+    capacities = [len(learner.replay) for learner in team.learners]
     assert sum(capacities) == 150
     assert len(set(capacities)) == 1
 
@@ -589,7 +566,7 @@ def test_shared_transitions_lead_to_the_same_agents_view():
     team = make("default", share_parameters=True)
     transition = next(walk(np.random.default_rng(3), 1))
     team.remember(*transition)
-    memory = team.learners[0].replay.memory
+    memory = team.learners[0].replay
     for agent in range(3):
         expected = view(transition[3], agent, team.spec)
         np.testing.assert_array_equal(memory.arrays.next_observations[agent, 0], expected)

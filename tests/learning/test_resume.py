@@ -17,8 +17,9 @@ import pytest
 import torch
 
 from baselines import independent_dqn, meta_dqn
-from baselines.learning import experiment
+from baselines.learning import train
 from baselines.learning.config import Options, preset_options
+from baselines.learning.training import METRICS, Training, train_learner
 from baselines.meta_dqn import Args, MetaLearner
 from baselines.runs import folder as runs
 from baselines.runs.checkpoints import Checkpoints
@@ -34,7 +35,6 @@ SHORT = {
     "code_units": 8,
     "evaluation_problems": 0,
     "checkpoint_seconds": 0.0,
-    "prefetch": False,  # no threads in a process that is forked
 }
 PRESETS = {
     "default": {"updates_per_episode": 6, "max_cycles": 20},
@@ -64,10 +64,10 @@ def options(kind: str, **changes: object) -> Options:
 def run(args: Options) -> int:
     """Train in this process, without the table and the figures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, "finish", lambda *_: None)
+        patch.setattr(train, "finish", lambda *_: None)
         if isinstance(args, independent_dqn.Args):
             return independent_dqn.main(args)
-        return experiment.run_experiment(args, meta_dqn.ALGORITHM, MetaLearner)
+        return train_learner(args, meta_dqn.ALGORITHM, MetaLearner)
 
 
 class Killer:
@@ -134,7 +134,7 @@ class Killer:
 
         patch.setattr(Path, "unlink", unlinked)
         for place, name in (
-            *((experiment.Training, "advance"), (Checkpoints, "save"), (RunFolder, "log")),
+            *((Training, "advance"), (Checkpoints, "save"), (RunFolder, "log")),
             *((RunFolder, "restart"), (RunFolder, "write_config")),
         ):
             patch.setattr(place, name, self.hooked(name, getattr(place, name)))
@@ -255,20 +255,12 @@ def test_a_training_where_folders_cannot_be_synced(whole, tmp_path, monkeypatch)
     assert results(tmp_path / "run") == whole("paper")[0]
 
 
-@pytest.mark.parametrize("kind", ["default", "independent"])
-def test_without_a_second_thread_the_same(kind, tmp_path):
-    """Preparing batches ahead in a second thread changes no byte."""
-    run(options(kind, out=tmp_path / "one"))
-    run(options(kind, out=tmp_path / "two", prefetch=True))
-    assert results(tmp_path / "one") == results(tmp_path / "two")
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_leave_a_checkpoint(number, tmp_path, monkeypatch, capsys):
     """Exit code 128 + signal, and the resumed run ends as if nothing had been."""
     whole, folder = tmp_path / "whole", tmp_path / "stopped"
     run(options("default", out=whole))
-    advance, calls = experiment.Training.advance, []
+    advance, calls = Training.advance, []
 
     def interrupted(self):
         calls.append(None)
@@ -277,7 +269,7 @@ def test_signals_leave_a_checkpoint(number, tmp_path, monkeypatch, capsys):
         return advance(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment.Training, "advance", interrupted)
+        patch.setattr(Training, "advance", interrupted)
         args = options("default", out=folder, checkpoint_seconds=1e9)
         assert run(args) == 128 + number
     assert "go on with --resume" in capsys.readouterr().out
@@ -290,7 +282,7 @@ def test_signals_leave_a_checkpoint(number, tmp_path, monkeypatch, capsys):
 
 def stop_at(args: Options, count: int, *numbers: int) -> int:
     """Train until a number of steps and updates, then send signals; return the exit code."""
-    advance, calls = experiment.Training.advance, []
+    advance, calls = Training.advance, []
 
     def stopped(self):
         calls.append(None)
@@ -300,7 +292,7 @@ def stop_at(args: Options, count: int, *numbers: int) -> int:
         return advance(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment.Training, "advance", stopped)
+        patch.setattr(Training, "advance", stopped)
         return run(args)
 
 
@@ -382,7 +374,7 @@ def test_a_power_cut_at_any_moment(tmp_path, monkeypatch):
     folder = tmp_path / "disk" / "runs" / "run"
     disk, copies = Disk(tmp_path / "disk"), []
     disk.root.mkdir()
-    advance, calls, kept = experiment.Training.advance, [], []
+    advance, calls, kept = Training.advance, [], []
 
     def watched(self):
         calls.append(None)
@@ -397,7 +389,7 @@ def test_a_power_cut_at_any_moment(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", keep)
-        patch.setattr(experiment.Training, "advance", watched)
+        patch.setattr(Training, "advance", watched)
         assert run(options("default", out=folder)) == 0
         copies.append(disk.after_a_cut(tmp_path / "end") / "runs" / "run")
     for handle in kept:
@@ -473,7 +465,7 @@ def test_two_trainings_in_one_folder(tmp_path):
     """While one is open, a second one is refused; afterwards it is not."""
     folder = tmp_path / "run"
     run(options("default", out=folder))
-    first = runs.RunFolder(folder, experiment.METRICS, resume=True)
+    first = runs.RunFolder(folder, METRICS, resume=True)
     with pytest.raises(ValueError, match="another training is writing into it"):
         run(Args(resume=folder))
     first.close()
@@ -637,7 +629,7 @@ def test_a_deleted_lock_lets_nobody_in(tmp_path):
     """While a training is open another one is refused, though its lock file was deleted."""
     folder = tmp_path / "run"
     run(options("default", out=folder))
-    first = RunFolder(folder, experiment.METRICS, resume=True)
+    first = RunFolder(folder, METRICS, resume=True)
     unfinished = folder / ".0123456789abcdef.tmp"
     unfinished.write_text("the first one is about to write this")
     (folder / ".lock").unlink()
@@ -653,7 +645,7 @@ def test_a_deleted_lock_lets_nobody_in(tmp_path):
 def test_a_metrics_file_that_is_taken_away_is_noticed(replaced, tmp_path):
     """A training whose metrics.csv is deleted or replaced ends with an error that names it."""
     folder = tmp_path / "run"
-    advance, calls = experiment.Training.advance, []
+    advance, calls = Training.advance, []
 
     def watched(self):
         calls.append(None)
@@ -665,7 +657,7 @@ def test_a_metrics_file_that_is_taken_away_is_noticed(replaced, tmp_path):
         return advance(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment.Training, "advance", watched)
+        patch.setattr(Training, "advance", watched)
         with pytest.raises(ValueError, match=r"metrics\.csv"):
             run(options("default", out=folder))
     assert len(calls) == 50

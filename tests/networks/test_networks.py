@@ -1,6 +1,8 @@
 """What networks promise: symmetries, conventions, start values, and which are refused."""
 
+import dataclasses
 from itertools import permutations, product
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -8,17 +10,22 @@ import pytest
 import torch
 
 from baselines.networks import (
-    Head,
+    ANY,
+    NETWORKS,
+    Network,
     NetworkSpec,
     build_network,
     greedy_actions,
-    linear,
+    network_spec,
+    spec_from_options,
     split_joint,
     torch_generator,
 )
-from baselines.networks.bags import Bag
-from baselines.networks.lookups import arrange, between_landmarks, routes
-from mapp_env import make_grid
+from baselines.networks.layers import EmbeddingBag, Head, linear
+from baselines.networks.pairs import arrange, between_landmarks, routes
+from baselines.policies import load_policy, play
+from baselines.policies.policy import save_policy
+from mapp_env import Grid, Problem, make_grid
 
 GRID = make_grid("paper-7x7")
 KINDS = ("paper", "pairs")
@@ -27,9 +34,9 @@ ROUTES = {"landmark_units": 6, "route_units": 5}
 
 def network_of(kind: str, n_agents: int, n_landmarks: int, outputs: str, **changes: object):
     """Return a small network with start values that are chance."""
-    spec = NetworkSpec(
-        kind, n_agents, n_landmarks, 4, 49, 16, outputs, **{"code_units": 8, **changes}
-    )
+    if kind == "pairs":
+        changes = {"code_units": 8, **changes}
+    spec = network_spec(kind, n_agents, n_landmarks, 4, 49, 16, outputs, **changes)
     return build_network(spec, torch_generator(np.random.SeedSequence(n_agents)))
 
 
@@ -166,12 +173,12 @@ def test_joint_actions_are_numbered_as_in_the_central_env(n_agents):
 @pytest.mark.parametrize("n_agents", [1, 2, 3])
 def test_greedy_actions_are_those_of_the_highest_values(n_agents):
     """Of joint values the one joint action, of agents' values each agent's own; ties the first."""
-    joint = NetworkSpec("paper", n_agents, 1, 4, 9, 8, outputs="joint")
+    joint = network_spec("paper", n_agents, 1, 4, 9, 8, outputs="joint")
     values = torch.eye(4**n_agents)
     expected = list(product(range(4), repeat=n_agents))
     assert [tuple(row) for row in greedy_actions(values, joint)] == expected
     assert greedy_actions(torch.zeros(1, 4**n_agents), joint).tolist() == [[0] * n_agents]
-    agents = NetworkSpec("paper", n_agents, 1, 4, 9, 8)
+    agents = network_spec("paper", n_agents, 1, 4, 9, 8)
     values = torch.from_numpy(np.random.default_rng(0).normal(size=(50, n_agents, 4)))
     np.testing.assert_array_equal(greedy_actions(values, agents), values.numpy().argmax(axis=2))
 
@@ -179,7 +186,7 @@ def test_greedy_actions_are_those_of_the_highest_values(n_agents):
 @pytest.mark.parametrize("outputs", ["joint", "agents"])
 def test_dueling_values_are_base_plus_advantages_less_their_mean(outputs):
     """The mean over actions is the base alone; differences are those of the advantages."""
-    spec = NetworkSpec("paper", 3, 2, 4, 9, 16, outputs, dueling=True)
+    spec = network_spec("paper", 3, 2, 4, 9, 16, outputs, dueling=True)
     head = Head(spec, torch.Generator().manual_seed(0))
     hidden = torch.randn(7, 16, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -191,7 +198,7 @@ def test_dueling_values_are_base_plus_advantages_less_their_mean(outputs):
     torch.testing.assert_close(means, base.view(means.shape), atol=1e-6, rtol=0.0)
     expected = advantages - advantages[..., :1]
     torch.testing.assert_close(values - values[..., :1], expected, atol=1e-6, rtol=0.0)
-    assert Head(NetworkSpec("paper", 3, 2, 4, 9, 16, outputs), None).value is None
+    assert Head(network_spec("paper", 3, 2, 4, 9, 16, outputs), None).value is None
 
 
 # -- start values ------------------------------------------------------------------------------
@@ -201,7 +208,7 @@ def test_dueling_values_are_base_plus_advantages_less_their_mean(outputs):
 @pytest.mark.parametrize("dueling", [False, True])
 def test_start_values_follow_the_seed_and_nothing_else(kind, dueling):
     """One seed one network, another seed another; PyTorch's global generator is not touched."""
-    spec = NetworkSpec(kind, 3, 5, 4, 49, 16, "joint", dueling, 8)
+    spec = network_spec(kind, 3, 5, 4, 49, 16, "joint", dueling)
     weights = []
     for turn, seed in enumerate((1, 1, 2)):
         torch.manual_seed(turn)
@@ -252,9 +259,9 @@ SMALL = {
         ({"n_cells": 1}, r"^n_cells must be .* got 1"),
         ({"n_cells": 512 * 512 + 1}, r"^n_cells must be .* got 262145"),
         ({"hidden_units": 4097}, r"^hidden_units must be .* got 4097"),
-        ({"code_units": 0}, r"^code_units must be .* got 0"),
-        ({"code_units": 2.0}, r"^code_units must be .* got 2\.0"),
-        ({"route_units": -1}, r"^route_units must be .* got -1"),
+        ({"kind": "pairs", "code_units": 0}, r"^code_units must be .* got 0"),
+        ({"kind": "pairs", "code_units": 2.0}, r"^code_units must be .* got 2\.0"),
+        ({"kind": "pairs", "route_units": -1}, r"^route_units must be .* got -1"),
         (
             {"kind": "pairs", "n_cells": 400, "route_units": 1},
             r"^kind 'pairs' would have 42,\d{3},\d{3} weights on 400",
@@ -273,7 +280,15 @@ SMALL = {
 def test_impossible_networks_are_refused_by_name(changes, message):
     """What no network can be, or would be too large, is refused before anything is allocated."""
     with pytest.raises(ValueError, match=message):
-        NetworkSpec(**{**SMALL, **changes})
+        build_network(network_spec(**{**SMALL, **changes}))
+
+
+def test_hopeless_sizes_are_refused_at_once():
+    """Weights that no machine has room for: counted without any memory for them."""
+    spec = network_spec("pairs", 5, 256, 5, 512 * 512, 4096, "agents", True, 4096, 4096, 4096)
+    for team in ("one", "independent", "shared"):
+        with pytest.raises(ValueError, match=r"would have [\d,]{25} weights"):
+            build_network(dataclasses.replace(spec, team=team))
 
 
 @pytest.mark.parametrize(
@@ -287,36 +302,61 @@ def test_impossible_networks_are_refused_by_name(changes, message):
 )
 def test_networks_at_the_limit_can_be_built(changes):
     """The largest that is allowed has the values it should have."""
-    spec = NetworkSpec(**{**SMALL, **changes})
+    spec = network_spec(**{**SMALL, **changes})
     seen = np.zeros((2, spec.observation_size), np.float32)
     assert values_of(build_network(spec), seen).shape == (2, *spec.values_shape)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"kind": "pairs", "outputs": "joint", "landmark_units": 7, "code_units": 5},
-        {"kind": "pairs", "outputs": "joint", "route_units": 3, "landmark_units": 7},
-        {"kind": "pairs", "n_landmarks": 1, "route_units": 3},
-        {"kind": "pairs", "team": "independent", "landmark_units": 3, "route_units": 2},
-        {"kind": "pairs", "dueling": True},
-        {"kind": "paper", "outputs": "joint", "dueling": True},
-        {"kind": "pairs", "team": "shared"},
-        {"kind": "pairs", "team": "independent", "landmark_units": 3},
-        {"kind": "paper", "team": "shared", "dueling": True},
-    ],
-)
-def test_weights_are_counted(changes):
-    """What a spec says before anything is allocated is what the network then has."""
-    spec = NetworkSpec(**{**SMALL, **changes})
-    assert spec.n_weights == sum(tensor.numel() for tensor in build_network(spec).parameters())
+class CompassSpec(NetworkSpec):
+    """Of a network that is a new one, and for grids of any size."""
+
+    kind = "compass"
+    any_size = ("n_cells",)
+
+
+class CompassNetwork(Network):
+    """Has one layer, from numbers of cells as they are."""
+
+    spec_type = CompassSpec
+
+    def __init__(self, spec, generator=None):
+        super().__init__(spec)
+        self.layer = linear(spec.n_inputs, spec.hidden_units, generator)
+        self.head = Head(spec, generator)
+
+    def forward(self, observations):
+        """Return action values."""
+        return self.head(self.layer(observations))
+
+
+@pytest.mark.parametrize("team", ["one", "independent", "shared"])
+def test_a_new_network_is_a_line_in_the_table(monkeypatch, tmp_path, team):
+    """With its spec and its place in NETWORKS it is built, saved, loaded and plays on any grid."""
+    monkeypatch.setitem(NETWORKS, "compass", CompassNetwork)
+    spec = network_spec("compass", 2, 3, 4, ANY, 16, team=team)
+    options = SimpleNamespace(n_agents=2, n_landmarks=3, hidden_units=16, dueling=False, more=1)
+    assert spec_from_options(options, "compass", GRID, team=team, n_cells=ANY) == spec
+    assert dataclasses.replace(spec, n_cells=49) == spec_from_options(
+        options, "compass", GRID, team=team
+    )
+    network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
+    save_policy(tmp_path / "weights", network, None)
+    policy = load_policy(tmp_path / "weights")
+    assert (policy.spec, policy.grid) == (spec, None)
+    for name, tensor in network.state_dict().items():
+        assert torch.equal(policy.network.state_dict()[name], tensor)
+    for rows, cols in ((3, 4), (40, 50)):
+        grid = Grid(np.zeros((rows, cols), np.bool_))
+        assert len(play(policy, [Problem(grid, (0, 1, 2), 2)], max_cycles=5)) == 1
+    with pytest.raises(ValueError, match=r"n_cells must be .* got 0"):
+        network_spec("paper", 2, 3, 4, ANY, 16, team=team)
 
 
 @pytest.mark.parametrize(("n_bags", "n_each"), [(1, 1), (7, 3), (200, 6)])
 def test_bags_sum_and_pass_gradients_on_like_pytorchs(n_bags, n_each):
     """Sums and gradients are those of nn.EmbeddingBag, however often a vector is looked up."""
     rng = np.random.default_rng(n_bags)
-    own = Bag(11, 5, 0.3, torch.Generator().manual_seed(0))
+    own = EmbeddingBag(11, 5, 0.3, torch.Generator().manual_seed(0))
     other = torch.nn.EmbeddingBag.from_pretrained(own.weight.detach().clone(), mode="sum")
     other.weight.requires_grad_()
     indices = torch.from_numpy(rng.integers(11, size=(n_bags, n_each)))

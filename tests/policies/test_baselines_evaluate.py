@@ -10,27 +10,27 @@ import numpy as np
 import pytest
 
 from baselines import evaluate as script
-from baselines.networks import NetworkSpec, build_network
+from baselines.networks import build_network, network_spec
 from baselines.policies import evaluation as evaluation_module
 from baselines.policies.evaluation import (
-    Setting,
     count_unseen,
     evaluate,
     every_problem,
     find_optima,
     format_table,
+    play,
     save_table,
     unseen_problems,
 )
 from baselines.policies.guidance import Guidance, GuidedPolicy
-from baselines.policies.policy import (
+from baselines.policies.policy import NetworkPolicy
+from baselines.policies.rules_of_thumb import (
+    RULES,
     EarliestArrivalPolicy,
     NearestLandmarkPolicy,
-    NetworkPolicy,
     RandomPolicy,
-    load_policy,
-    save_policy,
 )
+from baselines.policies.settings import Setting
 from mapp_env import Grid, Problem, make_grid, replay, solve
 
 PAPER = Setting(make_grid("paper-7x7"))
@@ -108,7 +108,7 @@ def test_earliest_arrival_is_the_solvers_benchmark(monkeypatch):
     benchmark = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(benchmark)
     problems = unseen_problems(PAPER, 100)
-    _, rule = evaluation_module.RULES["earliest"]
+    _, rule = RULES["earliest"]
     result = evaluate(rule(PAPER.grid, 3, 5), PAPER, problems)
     for objective in ("cover_time", "makespan"):
         costs = [
@@ -174,25 +174,18 @@ def grids_of_49_cells():
     yield Grid.from_text("D" + "." * 48)
 
 
-def test_a_policy_plays_on_its_own_grid_alone(tmp_path):
-    """Same size, another wall or depot: refused, guided too; an equal grid, or none named, plays.
-
-    A network whose weights do not say which grid they are of is refused on any.
-    """
-    spec = NetworkSpec("paper", 3, 5, 4, 49, 8)
+def test_a_policy_plays_on_its_own_grid_alone():
+    """Same size, another wall or depot: refused, guided too; an equal grid, or none, plays."""
+    spec = network_spec("paper", 3, 5, 4, 49, 8)
     network = build_network(spec)
     guidance = Guidance(PAPER.grid, 3, 5, 3)
     rng = np.random.default_rng(0)
     own = NetworkPolicy(network, Grid.from_text(PAPER.grid.to_text()))
     policies = [own, rivals(PAPER)[1], GuidedPolicy(own, guidance, 0.5, rng)]
     policies.append(GuidedPolicy(rivals(PAPER)[0], guidance, 0.5, rng))
-    save_policy(tmp_path / "w", network)
-    unknown = load_policy(tmp_path / "w")
     problems = unseen_problems(PAPER, 3)
     for policy in (*policies, NetworkPolicy(network)):
         assert len(evaluate(policy, PAPER, problems).steps) == 3
-    with pytest.raises(ValueError, match="not known: put the config"):
-        evaluate(unknown, PAPER, problems)
     for grid, said in zip(
         grids_of_49_cells(),
         (
@@ -448,3 +441,33 @@ def test_two_problems_of_two_landmarks(count):
     every = evaluate(policy, setting, landmarks)
     assert some.cover_time.tolist() == every.cover_time[:count].tolist()
     assert some.actions.shape[1] == count
+
+
+def test_playing_gives_the_plans_of_all_problems_in_order():
+    """Problems of two step limits, mixed: each plan is that of its own episode."""
+    for setting in (PAPER, WIDE):
+        policy = rivals(setting)[1]
+        problems = [
+            Problem(setting.grid, row, setting.n_agents, limit)
+            for row in unseen_problems(setting, 4).tolist()
+            for limit in (setting.max_cycles, 2)
+        ]
+        for problem, plan in zip(problems, play(policy, problems), strict=True):
+            plan.verify(problem)
+            alone = dataclasses.replace(setting, max_cycles=problem.max_cycles)
+            result = evaluate(policy, alone, np.array([problem.landmarks]))
+            assert (plan.success, plan.cover_time) == (result.success[0], result.cover_time[0])
+        assert play(policy, []) == []
+    with pytest.raises(ValueError, match="policy must be one of this grid"):
+        play(rivals(PAPER)[1], problems)
+
+
+def test_playing_without_a_limit_is_long_enough():
+    """The nearest landmark is always reached in time; a limit that is given counts instead."""
+    problem = Problem(PAPER.grid, (0, 6, 20, 42, 48), 3)
+    policy = rivals(PAPER)[1]
+    assert play(policy, [problem])[0].success
+    assert not play(policy, [problem], max_cycles=3)[0].success
+    for limit in (0, 10_000_000, 1.5):
+        with pytest.raises(ValueError, match="max_cycles must be"):
+            play(policy, [problem], max_cycles=limit)

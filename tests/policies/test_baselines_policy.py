@@ -9,22 +9,26 @@ import pytest
 import safetensors.torch
 import torch
 
-from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.networks import build_network, network_spec, torch_generator
 from baselines.policies.guidance import Guidance, GuidedPolicy
 from baselines.policies.policy import (
     WEIGHTS_KEY,
-    EarliestArrivalPolicy,
-    NearestLandmarkPolicy,
     NetworkPolicy,
-    RandomPolicy,
+    header,
     load_policy,
     save_policy,
+)
+from baselines.policies.rules_of_thumb import (
+    EarliestArrivalPolicy,
+    NearestLandmarkPolicy,
+    RandomPolicy,
 )
 from baselines.policies.settings import read_setting
 from mapp_env import Grid, make_grid
 
-SPEC = NetworkSpec("paper", 3, 5, 4, 49, 16)
-ABOUT = json.dumps({"version": 1, **SPEC.as_dict()})
+SPEC = network_spec("paper", 3, 5, 4, 49, 16)
+GRID = make_grid()
+ABOUT = json.dumps(header(SPEC, GRID))
 
 
 @pytest.fixture
@@ -50,7 +54,7 @@ def write(path, tensors, about=ABOUT):
 
 def test_loaded_policy_acts_like_the_saved_network(tmp_path, network):
     """From a file or from a run folder, actions are each agent's argmax of the same scores."""
-    save_policy(tmp_path / "policy.safetensors", network)
+    save_policy(tmp_path / "policy.safetensors", network, GRID)
     seen = observations(200)
     with torch.no_grad():
         expected = network(torch.from_numpy(seen)).argmax(dim=-1).numpy()
@@ -63,7 +67,7 @@ def test_loaded_policy_acts_like_the_saved_network(tmp_path, network):
 def test_saving_twice_writes_the_same_bytes(tmp_path, network):
     """The file depends on nothing but the network, and no temporary file stays behind."""
     for name in ("one", "two"):
-        save_policy(tmp_path / name, network)
+        save_policy(tmp_path / name, network, GRID)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
     assert sorted(os.listdir(tmp_path)) == ["one", "two"]
 
@@ -72,8 +76,8 @@ def test_half_precision_rounds_each_weight_and_halves_the_file(tmp_path, network
     """What is loaded are the weights rounded to 16 bits, but for tensors that do not fit there."""
     with torch.no_grad():
         network.layers[2].bias[3] = 1e6
-    save_policy(tmp_path / "whole", network)
-    save_policy(tmp_path / "half", network, half_precision=True)
+    save_policy(tmp_path / "whole", network, GRID)
+    save_policy(tmp_path / "half", network, GRID, half_precision=True)
     sizes = [(tmp_path / name).stat().st_size for name in ("whole", "half")]
     assert sizes[1] < 0.8 * sizes[0]
     whole, half = (load_policy(tmp_path / name).network.state_dict() for name in ("whole", "half"))
@@ -126,16 +130,20 @@ def test_weights_of_other_shapes_dtypes_or_names_are_refused(tmp_path, weights):
         "{",
         "[1]",
         "[" * 100_000,
-        '{"version": 1}',
-        ABOUT.replace('"version": 1', '"version": true'),
-        ABOUT.replace('"version": 1', '"version": 1.0'),
-        ABOUT.replace('"version": 1', '"version": 2'),
+        '{"version": 2}',
+        '{"version": 2, "grid": "any"}',
+        ABOUT.replace('"grid": "', '"grid": "x'),
+        ABOUT.replace('"grid": "', '"other": "'),
+        ABOUT.replace('"version": 2', '"version": true'),
+        ABOUT.replace('"version": 2', '"version": 2.0'),
+        ABOUT.replace('"version": 2', '"version": 3'),
         ABOUT.replace("16", "1e999"),
         ABOUT.replace("16", "NaN"),
         ABOUT.replace("16", "999999999"),
         ABOUT.replace('"n_agents": 3', '"n_agents": true'),
         ABOUT.replace('"kind": "paper"', '"kind": "other"'),
         ABOUT.replace("{", '{"n_agents": 3, ', 1),
+        ABOUT.replace('"network": {', '"network": {"n_agents": 3, '),
     ],
 )
 def test_foreign_or_damaged_descriptions_are_refused(tmp_path, weights, about):
@@ -147,7 +155,7 @@ def test_foreign_or_damaged_descriptions_are_refused(tmp_path, weights, about):
 
 def test_damaged_files_are_refused(tmp_path, network):
     """Cut at any length, or with any early byte changed to a brace, a file never loads wrong."""
-    save_policy(tmp_path / "good", network)
+    save_policy(tmp_path / "good", network, GRID)
     good = (tmp_path / "good").read_bytes()
     path = tmp_path / "bad"
     for length in (0, 1, 7, 8, 9, 100, 1000, len(good) - 1):
@@ -172,33 +180,34 @@ def test_a_zip_is_called_a_zip(tmp_path, network):
         load_policy(tmp_path / "model.zip")
 
 
-def test_a_policy_has_the_grid_that_its_config_names(tmp_path, network):
-    """By name, by folder and by file; without one that can be read, asking for it says why."""
+def test_a_policy_has_the_grid_of_its_weights(tmp_path, network):
+    """By name, by folder and by file, with or without a config; by default a policy names none."""
     for name in ("pretrained", "pretrained-distilled"):
         assert load_policy(name).grid == make_grid()
-    save_policy(tmp_path / "policy.safetensors", network)
     grid = Grid.from_text("\n".join(["D......"] + ["......."] * 6))
-    config = tmp_path / "config.json"
-    config.write_text(json.dumps({"grid": grid.to_text()}))
+    save_policy(tmp_path / "policy.safetensors", network, grid)
     for path in (tmp_path, tmp_path / "policy.safetensors"):
         assert load_policy(path).grid == grid
-    for text, reason in (
-        ("{", "not a readable config"),
-        ("{}", "no entry 'grid'"),
-        ('{"grid": "x"}', "grid: text:1"),
-        ('{"grid": 7}', "grid: text must be a str"),
-        ('{"grid": "D.."}', "its grid has 3 cells, the weights have 49"),
-        (None, "No such file"),
-    ):
-        if text is None:
-            config.unlink()
-        else:
-            config.write_text(text)
-        policy = load_policy(tmp_path)
-        assert policy.act(observations(2)).shape == (2, 3)
-        with pytest.raises(ValueError, match=rf"not known: put the config\.json .*{reason}"):
-            policy.grid  # noqa: B018
     assert NetworkPolicy(network).grid is None
+
+
+def test_weights_and_their_grid_fit_together(tmp_path, network, weights):
+    """A grid of another number of cells is neither written nor read, nor is any grid at all."""
+    for grid, said in ((Grid.from_text("D.."), "one of 3"), (None, "any grid")):
+        message = f"grid must have the network's 49 cells, got {said}"
+        with pytest.raises(ValueError, match=message):
+            save_policy(tmp_path / "w", network, grid)
+        text = "any" if grid is None else grid.to_text()
+        about = json.dumps({**json.loads(ABOUT), "grid": text})
+        with pytest.raises(ValueError, match=message):
+            load_policy(write(tmp_path / "w", weights, about))
+
+
+def test_weights_of_before_say_what_they_lack(tmp_path, weights):
+    """The first version knew no grid: refused by name, with what would do."""
+    about = json.dumps({"version": 1, **SPEC.as_dict()})
+    with pytest.raises(ValueError, match=r"w: .*do not say which grid .*'grid'.* train again"):
+        load_policy(write(tmp_path / "w", weights, about))
 
 
 def test_missing_and_irregular_files_are_refused(tmp_path):
@@ -287,8 +296,9 @@ def test_what_is_no_path_is_refused_by_name(path):
 
 def test_largest_network_can_be_loaded_again(tmp_path):
     """The most units, agents, landmarks and actions that a spec allows fit under the cap."""
-    spec = NetworkSpec("paper", 16, 256, 5, 512 * 512, 4096)
-    save_policy(tmp_path / "w", build_network(spec, torch_generator(np.random.SeedSequence(0))))
+    spec = network_spec("paper", 16, 256, 5, 512 * 512, 4096)
+    network = build_network(spec, torch_generator(np.random.SeedSequence(0)))
+    save_policy(tmp_path / "w", network, Grid(np.zeros((512, 512), np.bool_)))
     assert load_policy(tmp_path / "w").spec == spec
 
 
@@ -310,7 +320,7 @@ def test_one_large_weight_keeps_its_tensors_precision(tmp_path, network):
     """In half precision a tensor with a value that 16 bits have no room for is kept as it is."""
     with torch.no_grad():
         network.layers[0].weight[0, 0] = 1e6
-    save_policy(tmp_path / "policy.safetensors", network, half_precision=True)
+    save_policy(tmp_path / "policy.safetensors", network, GRID, half_precision=True)
     loaded = load_policy(tmp_path).network.state_dict()
     for name, tensor in network.state_dict().items():
         expected = tensor if name == "layers.0.weight" else tensor.half().float()

@@ -10,7 +10,8 @@ import torch
 
 import mapp_env
 from baselines import finetune, solve
-from baselines.networks import NetworkSpec, build_network, torch_generator
+from baselines.networks import build_network, network_spec, torch_generator
+from baselines.policies import play
 from baselines.policies.policy import NetworkPolicy, save_policy
 from baselines.policies.settings import Setting
 from mapp_env import Plan, make_grid, mapp_v0, replay
@@ -23,14 +24,15 @@ CELLS = tuple(GRID.reachable[[0, -1]].tolist())
 
 def untrained(kind: str = "pairs", outputs: str = "joint", team: str = "one") -> NetworkPolicy:
     """Return a policy that has learned nothing."""
-    spec = NetworkSpec(kind, 2, 2, 4, 25, 32, outputs, code_units=16, team=team)
+    options = {"code_units": 16} if kind == "pairs" else {}
+    spec = network_spec(kind, 2, 2, 4, 25, 32, outputs, team=team, **options)
     return NetworkPolicy(build_network(spec, torch_generator(np.random.SeedSequence(0))))
 
 
 @pytest.fixture
 def folder(tmp_path):
     """Return a run folder with an untrained policy."""
-    save_policy(tmp_path / "policy.safetensors", untrained().network)
+    save_policy(tmp_path / "policy.safetensors", untrained().network, GRID)
     config = {
         "options": {"n_agents": 2, "n_landmarks": 2, "max_cycles": 20},
         "grid": GRID.to_text(),
@@ -52,7 +54,7 @@ def folder(tmp_path):
 )
 def test_fine_tuning_finds_the_optimum(kind, outputs, team):
     """From an untrained policy of any kind, on a small grid, 30 episodes find the optimum."""
-    problem = solve.make_problem(SETTING, CELLS)
+    problem = SETTING.problem(CELLS)
     args = finetune.Args(
         landmarks=CELLS, imagined=512, updates_per_episode=5, learning_rate=0.005, patience=12
     )
@@ -70,8 +72,8 @@ def test_fine_tuning_finds_the_optimum(kind, outputs, team):
 
 def test_fine_tuning_never_makes_it_worse():
     """The policy's own episode is one of those played, so what counts is at least as good."""
-    problem = solve.make_problem(SETTING, CELLS)
-    before = solve.solve_by_policy(untrained(), SETTING, problem)
+    problem = SETTING.problem(CELLS)
+    before = play(untrained(), [problem])[0]
     args = finetune.Args(landmarks=CELLS, episodes=1)
     after, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
     assert n_episodes == 1
@@ -80,12 +82,12 @@ def test_fine_tuning_never_makes_it_worse():
 
 def test_the_best_episode_counts_and_waiting_ends(monkeypatch):
     """Not the last episode but the best; over when its own have not become shorter for a while."""
-    problem = solve.make_problem(SETTING, CELLS)
+    problem = SETTING.problem(CELLS)
     optimum = mapp_env.solve(problem)
     longer = [replace(optimum, cover_time=optimum.cover_time + n) for n in range(9)]
     # The policy's own, two at random, then those after training.
     plans = iter([longer[8], longer[8], longer[5], longer[6], longer[3], longer[4], longer[7]])
-    monkeypatch.setattr(finetune, "play", lambda env, tuner, random: next(plans))
+    monkeypatch.setattr(finetune, "run_episode", lambda env, tuner, random: next(plans))
     monkeypatch.setattr(finetune.Tuner, "train", lambda tuner: None)
     args = finetune.Args(landmarks=CELLS, random_episodes=2, patience=2)
     best, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
@@ -94,15 +96,15 @@ def test_the_best_episode_counts_and_waiting_ends(monkeypatch):
 
 def test_without_a_solution_all_episodes_are_played(monkeypatch):
     """However long it waits in vain; the first shows the policy, then as many as said explore."""
-    played, play = [], finetune.play
+    played, run_episode = [], finetune.run_episode
 
     def noted(env, tuner, random):
         played.append(random)
-        return play(env, tuner, random)
+        return run_episode(env, tuner, random)
 
-    monkeypatch.setattr(finetune, "play", noted)
+    monkeypatch.setattr(finetune, "run_episode", noted)
     short = Setting(GRID, 2, 2, 1)  # no time to come to either landmark
-    problem = solve.make_problem(short, CELLS)
+    problem = short.problem(CELLS)
     args = finetune.Args(landmarks=CELLS, episodes=9, random_episodes=3, patience=1, imagined=16)
     best, n_episodes = finetune.finetune(args, untrained(), short, problem)
     assert not best.success
@@ -152,7 +154,7 @@ def test_what_cannot_be_fine_tuned_is_refused(folder):
         finetune.Args(landmarks=CELLS, episodes=10, **changes)
         with pytest.raises(ValueError, match=r"has no effect with episodes 9 and random_episodes"):
             finetune.Args(landmarks=CELLS, episodes=9, **changes)
-    spec = NetworkSpec("paper", 7, 2, 4, 25, 8)
+    spec = network_spec("paper", 7, 2, 4, 25, 8)
     large = NetworkPolicy(build_network(spec, torch_generator(np.random.SeedSequence(0))))
     problem = mapp_env.Problem(GRID, CELLS, 7)
     with pytest.raises(ValueError, match=r"policy must be of a team with at most 1,024 joint"):
@@ -163,8 +165,8 @@ def test_a_policy_of_another_grid_is_not_fine_tuned():
     """As many cells, one wall moved: refused before anything is played."""
     other = make_grid("random", rows=5, cols=5, seed=2, density=0.1)
     policy = NetworkPolicy(untrained().network, other)
-    problem = solve.make_problem(SETTING, CELLS)
-    with pytest.raises(ValueError, match="policy must be one of this grid, got one of another"):
+    problem = SETTING.problem(CELLS)
+    with pytest.raises(ValueError, match=r"policy must be one of this grid, or of any"):
         finetune.finetune(finetune.Args(landmarks=CELLS), policy, SETTING, problem)
 
 
@@ -173,14 +175,14 @@ def test_imagined_episodes_are_made_of_experienced_moves():
 
     With no move known, or none that leads on, nothing is imagined; no unknown move ever is.
     """
-    problem = solve.make_problem(SETTING, CELLS)
+    problem = SETTING.problem(CELLS)
     args = finetune.Args(landmarks=CELLS, imagined=64)
     tuner = finetune.Tuner(args, untrained().network, problem)
     assert tuner.imagine() is None
     rng = np.random.default_rng(0)
     env = mapp_v0.parallel_env(GRID, 2, 2, 20)
     for _ in range(3):
-        finetune.play(env, tuner, random=True)
+        finetune.run_episode(env, tuner, random=True)
     known = tuner.moves != finetune.UNKNOWN
     np.testing.assert_array_equal(tuner.moves[known], np.asarray(GRID.moves)[:, :4][known])
     for _ in range(20):
@@ -224,9 +226,9 @@ def test_what_cannot_be_solved_is_refused(folder):
 
 def test_patience_begins_after_the_random_episodes(monkeypatch):
     """Only episodes played after training count as waiting, however long the random ones are."""
-    problem = solve.make_problem(SETTING, CELLS)
+    problem = SETTING.problem(CELLS)
     optimum = mapp_env.solve(problem)
-    monkeypatch.setattr(finetune, "play", lambda env, tuner, random: optimum)
+    monkeypatch.setattr(finetune, "run_episode", lambda env, tuner, random: optimum)
     monkeypatch.setattr(finetune.Tuner, "train", lambda tuner: None)
     for random_episodes, patience in ((0, 1), (2, 1), (5, 3)):
         args = finetune.Args(
@@ -238,7 +240,7 @@ def test_patience_begins_after_the_random_episodes(monkeypatch):
 
 def test_a_searchs_best_is_not_called_the_optimum(folder, capsys):
     """Only what is proven is reported as the optimum, and only to that there is a gap."""
-    problem = solve.make_problem(SETTING, CELLS)
+    problem = SETTING.problem(CELLS)
     best = mapp_env.solve(problem)
     for optimum, label in ((best, "optimum:"), (replace(best, status="feasible"), "best known:")):
         solve.report(problem, {"policy": best}, optimum)
@@ -249,8 +251,8 @@ def test_a_searchs_best_is_not_called_the_optimum(folder, capsys):
 
 def test_the_exit_code_tells_whether_it_is_solved(folder, monkeypatch):
     """0 for a policy that visits all, 1 for one that does not."""
-    problem = solve.make_problem(SETTING, CELLS)
+    problem = SETTING.problem(CELLS)
     plans = {0: mapp_env.solve(problem), 1: replay(problem, [[0, 0]])}
     for code, plan in plans.items():
-        monkeypatch.setattr(solve, "solve_by_policy", lambda *_, plan=plan: plan)
+        monkeypatch.setattr(solve, "play", lambda *_, plan=plan: [plan])
         assert solve.main(solve.Args(CELLS, str(folder))) == code

@@ -5,19 +5,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from baselines.networks import NetworkSpec, split_joint
-from baselines.replay.imagined import UNKNOWN, ImaginedReplay, relabelled_reward, try_actions
+from baselines.networks import network_spec, split_joint
+from baselines.replay.imagined import UNKNOWN, ImaginedReplay, try_actions
 from baselines.replay.own_imagined import OwnImaginedReplay
+from baselines.replay.relabelled import RelabelledReward, relabelled_reward
 from mapp_env import Grid, make_grid
-from mapp_env.engine.rules import (
-    ALL_PAIRS,
-    BY_COORDINATES,
-    NO_DISTANCES,
-    Reward,
-    cell_table,
-    row_length,
-    step_row,
-)
+from mapp_env.engine.rules import Reward, step_row
+from mapp_env.engine.state import new_rows, split
+from mapp_env.engine.task import make_world
 
 GRIDS = {
     "paper": make_grid("paper-7x7"),
@@ -25,13 +20,12 @@ GRIDS = {
     "rooms": Grid.from_text("....#...\n..#....#\n.#..D.#.\n...##...\n.#......"),
     "hall": Grid.from_text("......\n......\n...D..\n......"),
 }
-TABLES = {grid: cell_table(grid) for grid in GRIDS.values()}
 REWARDS = ("manhattan", "geodesic", "step")
 
 
 def make_replay(grid: Grid, n_agents: int, n_landmarks: int, **changes: object) -> ImaginedReplay:
     """Return a replay that knows nothing yet."""
-    spec = NetworkSpec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, outputs="joint")
+    spec = network_spec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, outputs="joint")
     options = {
         "n_rows": 32,
         "n_tried": 3,
@@ -40,7 +34,17 @@ def make_replay(grid: Grid, n_agents: int, n_landmarks: int, **changes: object) 
         "from_depot": 0.5,
         "max_length": 12,
     }
-    return ImaginedReplay(spec, grid.depot, **{**options, **changes})
+    return ImaginedReplay(spec, grid, **{**options, **changes})
+
+
+def tell(replay, observation, actions, next_observation) -> None:
+    """Let a replay store a transition, whose reward and end it does not read."""
+    replay.add(observation, actions, np.nan, next_observation, None)
+
+
+def rewards_for(replay: ImaginedReplay, grid: Grid, kind: str, scale: float) -> RelabelledReward:
+    """Return a reward of the replay's transitions."""
+    return relabelled_reward(grid, replay.spec.n_agents, replay.spec.n_landmarks, kind, scale)
 
 
 def experience(replay: ImaginedReplay, grid: Grid, rng: np.random.Generator, share: float) -> None:
@@ -50,7 +54,8 @@ def experience(replay: ImaginedReplay, grid: Grid, rng: np.random.Generator, sha
         if rng.random() < share:
             here, there = np.full(n, cell), np.full(n, grid.moves[cell, action])
             rest = np.zeros(2 * k)
-            replay.remember(
+            tell(
+                replay,
                 np.concatenate((here, rest)).astype(np.float32),
                 np.full(n, action),
                 np.concatenate((there, rest)).astype(np.float32),
@@ -62,17 +67,12 @@ def step_by_the_rules(
 ) -> tuple[np.ndarray, float, bool]:
     """Return the next observation, the reward and whether it ends, from the env's own kernel."""
     n_landmarks = (len(observation) - n_agents) // 2
-    row = np.zeros(row_length(n_agents, n_landmarks), np.int32)
-    row[: len(observation)] = observation
-    distances, first = NO_DISTANCES, BY_COORDINATES
-    if kind == "geodesic":
-        distances, first = np.array(grid.distances, np.int32), ALL_PAIRS
-        distances.flags.writeable = False
-    reward, terminated, _ = step_row(
-        row, np.array(actions), n_agents, n_landmarks, 10**6, int(Reward[kind.upper()]),
-        TABLES[grid], distances, first,
-    )  # fmt: skip
-    return row[: len(observation)].astype(np.float32), reward, terminated
+    row = new_rows(1, n_agents, n_landmarks)[0]
+    head = split(row, n_agents, n_landmarks).head
+    head[:] = observation
+    world = make_world(grid, n_agents, n_landmarks, Reward[kind.upper()])
+    reward, terminated, _ = step_row(row, np.array(actions), 10**6, world)
+    return head.astype(np.float32), reward, terminated
 
 
 def round_of(replay, reward, rng):
@@ -109,7 +109,7 @@ def test_every_imagined_transition_is_the_rules_own(name, n_agents, n_landmarks,
     rng = np.random.default_rng([n_agents, n_landmarks])
     replay = make_replay(grid, n_agents, n_landmarks, n_rows=24, from_depot=0.2)
     experience(replay, grid, rng, 1.0)
-    reward = relabelled_reward(grid, kind, scale)
+    reward = rewards_for(replay, grid, kind, scale)
     ended = 0
     for _ in range(16):
         batch, _ = round_of(replay, reward, rng)
@@ -117,10 +117,10 @@ def test_every_imagined_transition_is_the_rules_own(name, n_agents, n_landmarks,
         assert batch.observations.dtype == batch.next_observations.dtype == np.float32
         assert batch.rewards.dtype == np.float32
         for row, tried in product(range(24), range(3)):
-            following, expected, terminated = step_by_the_rules(
+            next_obs, expected, terminated = step_by_the_rules(
                 grid, batch.observations[row], batch.actions[row, tried], kind, n_agents
             )
-            np.testing.assert_array_equal(batch.next_observations[row, tried], following)
+            np.testing.assert_array_equal(batch.next_observations[row, tried], next_obs)
             assert batch.terminated[row, tried] == terminated
             if scale == 0.1:
                 assert batch.rewards[row, tried] == pytest.approx(scale * expected, rel=1e-6)
@@ -141,7 +141,7 @@ def test_no_move_that_nobody_made_is_imagined(n_agents, share):
     made = replay.moves.copy()
     known = replay._known_cells()
     for _ in range(60):
-        batch, _ = round_of(replay, relabelled_reward(grid, "step", 1.0), rng)
+        batch, _ = round_of(replay, rewards_for(replay, grid, "step", 1.0), rng)
         cells = batch.observations[:, None, :n_agents].astype(int)
         led_to = made[cells, batch.actions]
         assert (led_to != UNKNOWN).all()
@@ -157,8 +157,8 @@ def test_known_actions_are_those_made():
     rng = np.random.default_rng(0)
     experience(replay, grid, rng, 0.5)
     cells = rng.integers(grid.n_cells, size=(200, 2))
-    seen = np.concatenate((cells, np.zeros((200, 2))), axis=1).astype(np.float32)
-    known = replay.known_actions(seen)
+    obs = np.concatenate((cells, np.zeros((200, 2))), axis=1).astype(np.float32)
+    known = replay.known_actions(obs)
     untouched = 0
     for row, agent in product(range(200), range(2)):
         made = replay.moves[cells[row, agent]] != UNKNOWN
@@ -166,13 +166,14 @@ def test_known_actions_are_those_made():
         np.testing.assert_array_equal(known[row, agent], made if made.any() else [True] * 4)
     assert untouched
     experience(replay, grid, rng, 1.0)
-    assert replay.known_actions(seen) is None
+    assert replay.known_actions(obs) is None
 
 
 def test_moves_are_remembered_agent_by_agent():
     """Each agent's own action is kept with its own cell and where that led."""
     replay = make_replay(GRIDS["hall"], 3, 1)
-    replay.remember(
+    tell(
+        replay,
         np.array([0, 7, 15, 9, 0], np.float32),
         np.array([1, 3, 0]),
         np.array([1, 13, 14, 9, 0], np.float32),
@@ -187,7 +188,8 @@ def test_ready_only_with_room_for_the_landmarks():
     grid = GRIDS["corridor"]
     replay = make_replay(grid, 1, 2)
     for cell, ready in ((3, False), (2, False), (4, True), (5, True)):
-        replay.remember(
+        tell(
+            replay,
             np.array([cell, 0, 0, 0, 0], np.float32),
             np.array([2]),
             np.array([cell, 0, 0, 0, 0], np.float32),
@@ -281,7 +283,7 @@ def test_only_ended_episodes_begin_anew():
     rng = np.random.default_rng(0)
     replay = make_replay(grid, 2, 2, n_rows=64, max_length=6)
     experience(replay, grid, rng, 1.0)
-    reward = relabelled_reward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
     solved = timed_out = went_on = 0
     for _ in range(40):
         ended = replay.visited.all(axis=1) | (replay.ages >= 6)
@@ -325,16 +327,16 @@ def test_given_up_episodes_are_tried_again(retries):
     assert not replay.visited[again].any()
 
 
-def test_stuck_states_end_the_story():
+def test_episodes_stop_in_cells_without_recorded_moves():
     """Where an agent has come to a cell that nobody has left, the next draw begins anew."""
     replay = make_replay(GRIDS["corridor"], 1, 1, n_rows=200, from_depot=1.0, max_length=50)
     # Right from the depot leads to a cell that nobody has moved from; left to one that is known.
     for cell, action, there in ((3, 1, 4), (3, 0, 2), (2, 1, 3), (2, 0, 1), (1, 0, 0), (1, 1, 2)):
-        replay.remember(
-            np.array([cell, 0, 0], np.float32), np.array([action]), np.array([there, 0, 0])
+        tell(
+            replay, np.array([cell, 0, 0], np.float32), np.array([action]), np.array([there, 0, 0])
         )
     rng = np.random.default_rng(0)
-    reward = relabelled_reward(GRIDS["corridor"], "step", 1.0)
+    reward = rewards_for(replay, GRIDS["corridor"], "step", 1.0)
     met = 0
     for _ in range(30):
         replay.start_over(rng)
@@ -351,19 +353,11 @@ def test_stuck_states_end_the_story():
 
 
 def imagine(values, chances, temperature, moves, cells):
-    """Return the joint actions tried in one state far from its landmark."""
+    """Return the joint actions tried in one state."""
     n_agents = len(cells)
-    return try_actions(
-        np.array([cells]),
-        np.array([[23]]),
-        np.zeros((1, 1), np.bool_),
-        values[None],
-        chances[None],
-        temperature,
-        moves,
-        split_joint(np.arange(4**n_agents), n_agents, 4),
-        *relabelled_reward(GRIDS["hall"], "step", 1.0),
-    )[0][0]
+    digits = split_joint(np.arange(4**n_agents), n_agents, 4)
+    cells, values, chances = np.array([cells]), values[None], chances[None]
+    return try_actions(cells, values, chances, temperature, moves, digits)[0]
 
 
 @pytest.mark.parametrize("temperature", [0.3, 1.0])
@@ -415,7 +409,7 @@ def test_exploration_is_the_share_of_other_actions_followed():
         experience(replay, grid, rng, 1.0)
         replay.start_over(rng)
         values = np.tile(np.array([0.0, 0.1, 0.0, 0.0], np.float32), (4000, 1))
-        batch, _ = replay.draw(values, relabelled_reward(grid, "step", 1.0), rng)
+        batch, _ = replay.draw(values, rewards_for(replay, grid, "step", 1.0), rng)
         rows = np.arange(4000)
         # From the depot in the open every action leads elsewhere.
         followed = (batch.next_observations[:, :, 0] == replay.cells).argmax(axis=1)
@@ -438,7 +432,7 @@ def test_no_more_actions_are_tried_than_there_are():
 
 def play(replay: ImaginedReplay, grid: Grid, rng: np.random.Generator, rounds: int) -> list:
     """Return all arrays of some draws."""
-    reward = relabelled_reward(grid, "manhattan", 0.1)
+    reward = rewards_for(replay, grid, "manhattan", 0.1)
     return [array for _ in range(rounds) for array in round_of(replay, reward, rng)[0]]
 
 
@@ -491,7 +485,7 @@ def test_arrays_of_another_replay_are_refused_by_name(name):
 
 def make_own(grid: Grid, n_agents: int, n_landmarks: int, agent: int, **changes: object):
     """Return a replay of one agent that knows nothing yet."""
-    spec = NetworkSpec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, team="independent")
+    spec = network_spec("paper", n_agents, n_landmarks, 4, grid.n_cells, 8, team="independent")
     options = {
         "capacity": 10_000,
         "fresh": 0.7,
@@ -503,7 +497,7 @@ def make_own(grid: Grid, n_agents: int, n_landmarks: int, agent: int, **changes:
         "max_length": 12,
         "retries": 0.5,
     }
-    return OwnImaginedReplay(spec, agent, grid.depot, **{**options, **changes})
+    return OwnImaginedReplay(spec, grid, agent, **{**options, **changes})
 
 
 def walk(grid: Grid, n_agents: int, n_landmarks: int, rng: np.random.Generator, n_steps: int):
@@ -512,18 +506,18 @@ def walk(grid: Grid, n_agents: int, n_landmarks: int, rng: np.random.Generator, 
     for _ in range(n_steps):
         if step == 0:
             landmarks = rng.choice(grid.reachable, n_landmarks, replace=False)
-            seen = np.zeros(n_agents + 2 * n_landmarks, np.float32)
-            seen[:n_agents], seen[n_agents : n_agents + n_landmarks] = grid.depot, landmarks
+            obs = np.zeros(n_agents + 2 * n_landmarks, np.float32)
+            obs[:n_agents], obs[n_agents : n_agents + n_landmarks] = grid.depot, landmarks
         actions = rng.integers(4, size=n_agents)
-        following, _, over = step_by_the_rules(grid, seen, actions, "step", n_agents)
-        yield seen, actions, following
-        step, seen = (0 if over or step == 14 else step + 1), following
+        next_obs, _, over = step_by_the_rules(grid, obs, actions, "step", n_agents)
+        yield obs, actions, next_obs
+        step, obs = (0 if over or step == 14 else step + 1), next_obs
 
 
 def own_round(replay: OwnImaginedReplay, reward, rng):
     """Begin and draw once, with values that are chance."""
     replay.start_over(rng)
-    return replay.draw(rng.normal(size=(len(replay.cells), 4)).astype(np.float32), reward, rng)
+    return replay.draw(rng.normal(size=(len(replay.cells), 4)).astype(np.float32), reward, rng)[0]
 
 
 @pytest.mark.parametrize(
@@ -548,11 +542,11 @@ def test_an_agent_imagines_its_own_moves_by_the_rules(
     grid = GRIDS[name]
     rng = np.random.default_rng([n_agents, n_landmarks])
     replay = make_own(grid, n_agents, n_landmarks, agent, capacity=capacity)
-    reward = relabelled_reward(grid, kind, 0.5)
+    reward = rewards_for(replay, grid, kind, 0.5)
     own, seen = set(), [set() for _ in range(n_agents)]
     ended = rounds = 0
     for step, (before, actions, after) in enumerate(walk(grid, n_agents, n_landmarks, rng, 400)):
-        replay.remember(before, actions[[agent]], after)
+        tell(replay, before, actions[[agent]], after)
         own.add((before[agent], actions[agent], after[agent]))
         for other in range(n_agents):
             seen[other].add((before[other], after[other]))
@@ -570,10 +564,10 @@ def test_an_agent_imagines_its_own_moves_by_the_rules(
             cells = here[:n_agents].astype(int)
             moves = grid.moves[cells] == there[:n_agents, None]  # some action of the others
             moves[agent] = np.arange(4) == batch.actions[row, tried, 0]
-            following, expected, terminated = step_by_the_rules(
+            next_obs, expected, terminated = step_by_the_rules(
                 grid, here, moves.argmax(axis=1), kind, n_agents
             )
-            np.testing.assert_array_equal(there, following)
+            np.testing.assert_array_equal(there, next_obs)
             assert batch.rewards[row, tried] == 0.5 * expected
             assert batch.terminated[row, tried] == terminated
             # Where landmarks can be, all different, and none that is unvisited under an agent.
@@ -596,7 +590,7 @@ def test_the_others_go_along_what_was_seen(capacity):
     first, on, last = set(), [set(), set(), set()], [set(), set(), set()]
     previous = None
     for before, actions, after in walk(grid, 3, 5, rng, 600):
-        replay.remember(before, actions[[1]], after)
+        tell(replay, before, actions[[1]], after)
         begins = previous is None or (previous[1] != before).any()
         if begins:
             first.add((*after[[0, 2]],))
@@ -608,7 +602,7 @@ def test_the_others_go_along_what_was_seen(capacity):
         previous = before, after
     for other in (0, 2):
         last[other].add((previous[0][other], previous[1][other]))
-    reward = relabelled_reward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
     came_from = None
     changed = 0
     for _ in range(60):
@@ -635,12 +629,12 @@ def test_where_a_stretch_ends_any_other_goes_on():
     replay = make_own(grid, 3, 5, 1, n_rows=4000, from_depot=1.0, max_length=2, retries=0.0)
     seen = np.zeros((3, 49))
     for before, actions, after in walk(grid, 3, 5, rng, 600):
-        replay.remember(before, actions[[1]], after)
+        tell(replay, before, actions[[1]], after)
         for other in (0, 2):
             seen[other, int(after[other])] += before[other] == grid.depot
     replay.start_over(rng)
     replay.moments[:] = UNKNOWN  # as if all had come to the depot at the end of theirs
-    batch = own_round(replay, relabelled_reward(grid, "step", 1.0), rng)
+    batch = own_round(replay, rewards_for(replay, grid, "step", 1.0), rng)
     for other in (0, 2):
         found = np.bincount(batch.next_observations[:, 0, other].astype(int), minlength=49)
         np.testing.assert_allclose(found / 4000, seen[other] / seen[other].sum(), atol=0.04)
@@ -652,7 +646,7 @@ def test_nothing_is_imagined_before_a_beginning_is_known():
     replay = make_own(grid, 3, 5, 1, capacity=10)
     ready = []
     for before, actions, after in walk(grid, 3, 5, np.random.default_rng(0), 300):
-        replay.remember(before, actions[[1]], after)
+        tell(replay, before, actions[[1]], after)
         begins = (before[:3] == grid.depot).all()
         ready = [replay.ready] if begins else [*ready, replay.ready]
         if len(ready) > 10:
@@ -670,10 +664,10 @@ def test_the_share_of_fresh_landmarks(fresh):
     )
     played = {}
     for before, actions, after in walk(grid, 3, 5, rng, 600):
-        replay.remember(before, actions[[1]], after)
+        tell(replay, before, actions[[1]], after)
         if (before[[0, 1, 2]] == grid.depot).all():
             played.setdefault((*after[[0, 2]],), set()).add(tuple(before[3:8]))
-    batch = own_round(replay, relabelled_reward(grid, "step", 1.0), rng)
+    batch = own_round(replay, rewards_for(replay, grid, "step", 1.0), rng)
     kept = [
         tuple(here[3:8]) in played[(*there[[0, 2]],)]
         for here, there in zip(batch.observations, batch.next_observations[:, 0], strict=True)
@@ -692,8 +686,8 @@ def test_own_episodes_begin_and_begin_again():
         grid, 3, 5, 1, n_rows=2000, fresh=1.0, from_depot=0.6, max_length=3, retries=0.7
     )
     for before, actions, after in walk(grid, 3, 5, rng, 1000):
-        replay.remember(before, actions[[1]], after)
-    reward = relabelled_reward(grid, "step", 1.0)
+        tell(replay, before, actions[[1]], after)
+    reward = rewards_for(replay, grid, "step", 1.0)
 
     def begin():
         rows = replay.start_over(rng)
@@ -726,14 +720,14 @@ def test_own_best_action_is_tried_first_and_followed(exploration):
     replay = make_own(grid, 3, 5, 1, n_rows=2000, exploration=exploration)
     made = np.zeros((49, 4), bool)
     for before, actions, after in walk(grid, 3, 5, rng, 90):
-        replay.remember(before, actions[[1]], after)
+        tell(replay, before, actions[[1]], after)
         made[int(before[1]), actions[1]] = True
     assert not made[made.any(axis=1)].all()
-    reward = relabelled_reward(grid, "step", 1.0)
+    reward = rewards_for(replay, grid, "step", 1.0)
     for _ in range(4):
         replay.start_over(rng)
         values = rng.normal(size=(2000, 4)).astype(np.float32)
-        batch = replay.draw(values, reward, rng)
+        batch, _ = replay.draw(values, reward, rng)
         known = made[batch.observations[:, 1].astype(int)]
         best = np.where(known, values, -np.inf).argmax(axis=1)
         np.testing.assert_array_equal(batch.actions[:, 0, 0], best)
@@ -749,11 +743,11 @@ def test_own_best_action_is_tried_first_and_followed(exploration):
 def test_own_restored_replay_goes_on_bit_for_bit():
     """A replay that takes over another's arrays draws what the other does, and shares none."""
     grid = GRIDS["rooms"]
-    reward = relabelled_reward(grid, "manhattan", 1.0)
+    reward = relabelled_reward(grid, 3, 2, "manhattan")
     first, rng = make_own(grid, 3, 2, 1, capacity=200), np.random.default_rng(0)
     steps = list(walk(grid, 3, 2, rng, 330))
     for before, actions, after in steps[:300]:
-        first.remember(before, actions[[1]], after)
+        tell(first, before, actions[[1]], after)
     for _ in range(9):
         own_round(first, reward, rng)
     second = make_own(grid, 3, 2, 1, capacity=200)
@@ -764,7 +758,7 @@ def test_own_restored_replay_goes_on_bit_for_bit():
         own = np.random.default_rng(1)
         drawn.append([])
         for before, actions, after in steps[300:]:
-            replay.remember(before, actions[[1]], after)
+            tell(replay, before, actions[[1]], after)
             drawn[-1].extend(array.tobytes() for array in own_round(replay, reward, own))
     assert drawn[0] == drawn[1]
     second.moves[:] = 0

@@ -59,7 +59,7 @@ def test_variants_are_what_they_are_called():
     """Each variant changes what its name says, to what it says."""
     learners = {}
     for variant, words in VARIANTS.items():
-        more = ["--hidden-units", "8", "--batch-size", "4", "--no-prefetch"]
+        more = ["--hidden-units", "8", "--batch-size", "4"]
         more += ["--code-units", "4"] * ("--network" not in words)  # of the network "pairs" alone
         args = parse_options(meta_dqn.Args, "", [*more, *words])
         learners[variant] = meta_dqn.MetaLearner(args, make_grid(), Streams.spawn(0))

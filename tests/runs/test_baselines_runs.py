@@ -21,14 +21,16 @@ from matplotlib.figure import Figure
 
 import mapp_env
 from baselines import evaluate, meta_dqn
-from baselines.learning import experiment
+from baselines.learning import train
 from baselines.learning.config import preset_options
+from baselines.learning.training import METRICS
 from baselines.policies import figures
 from baselines.policies.figures import draw_learning_curves
 from baselines.policies.guidance import GuidedPolicy
 from baselines.policies.policy import load_policy
-from baselines.runs import folder as runs
-from baselines.runs.folder import RunFolder, describe_environment, read_config, read_metrics
+from baselines.runs import provenance
+from baselines.runs.folder import RunFolder, read_config, read_metrics
+from baselines.runs.stop import StopSignals
 from mapp_env import Grid
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,7 +88,7 @@ def two_runs(tmp_path_factory):
 def test_a_run_says_the_version_that_it_runs_with(monkeypatch):
     """The environment's version is that of what was imported, not of what is installed."""
     monkeypatch.setattr(mapp_env, "__version__", "9.8.7")
-    assert describe_environment()["versions"]["mapp_env"] == "9.8.7"
+    assert provenance.describe_environment()["versions"]["mapp_env"] == "9.8.7"
 
 
 def test_run_leaves_all_it_promises(two_runs):
@@ -102,7 +104,7 @@ def test_run_leaves_all_it_promises(two_runs):
     assert {"python", "numpy", "torch", "mapp_env"} <= set(config["environment"]["versions"])
 
     rows = list(csv.DictReader((run / "metrics.csv").read_text().splitlines()))
-    assert tuple(rows[0]) == experiment.METRICS
+    assert tuple(rows[0]) == METRICS
     assert [row["episode"] for row in rows] == list("123456")
     assert [row["problem"] for row in rows] == list("111222")
     for row in rows:
@@ -150,7 +152,7 @@ def test_default_preset_leaves_all_it_promises(tmp_path, capsys):
     for path in (args.out, *args.out.rglob("*")):
         assert path.stat().st_mode & 0o777 == (0o750 if path.is_dir() else 0o640), path
     columns = read_metrics(args.out)
-    assert tuple(columns) == experiment.METRICS
+    assert tuple(columns) == METRICS
     assert columns["guidance"] == [0.0] * 6
     assert columns["updates"][-1] == 3
     rows = list(csv.reader((args.out / "evaluation.csv").read_text().splitlines()))[1:]
@@ -293,7 +295,10 @@ def test_torn_last_row_of_metrics_is_left_out(tmp_path):
 def test_damaged_config_is_refused(tmp_path, text):
     """A config that is no JSON object, or says something twice, is refused with its path."""
     (tmp_path / "config.json").write_text(text)
-    with pytest.raises(ValueError, match=r"config\.json: not a readable config"):
+    with pytest.raises(
+        ValueError,
+        match=r"config\.json: (is not strict JSON|is nested too deeply|must hold a JSON object)",
+    ):
         read_config(tmp_path)
 
 
@@ -403,14 +408,14 @@ def test_evaluation_takes_the_unseen_problems_there_are(tmp_path, capsys, n_prob
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"max_cycles": 50', '"max_cycles": 1e999', "max_cycles must be .* got inf"),
+        ('"max_cycles": 50', '"max_cycles": 1e999', "'1e999' is not a finite number"),
         ('"max_cycles": 50', '"max_cycles": 5.9', r"max_cycles must be .* got 5\.9"),
         ('"max_cycles": 50', '"cycles": 50', "no entry 'max_cycles'"),
         ('"n_agents": 3', '"n_agents": true', "n_agents must be .* got True"),
         ('"n_landmarks": 5', '"n_landmarks": 4', r"training_problems\[0\]: must have 4"),
-        ('"training_problems": [', '"training_problems": [[1e999],', r"training_problems\[0\]: "),
+        ('"training_problems": [', '"training_problems": [[0.5],', r"training_problems\[0\]: "),
         ('"training_problems": [', '"training_problems": [7,', r"training_problems\[0\]: "),
-        ('"training_problems"', '"training_problems": 1e999, "rest"', "training_problems a list"),
+        ('"training_problems"', '"training_problems": 1.5, "rest"', "training_problems a list"),
         ('"options"', '"options": [], "rest"', "options must be an object"),
         ('"n_agents": 3', '"n_agents": 2', "n_agents is 2 by config.json, and 3 by the weights"),
     ],
@@ -443,7 +448,7 @@ def test_weights_of_another_grid_are_refused_by_name(two_runs, tmp_path):
 @pytest.mark.parametrize("column", ["episode", "problem", "steps", "reward"])
 def test_curves_without_a_column_are_refused_by_name(tmp_path, column):
     """A metrics file that lacks what is drawn is refused with its path and the column."""
-    columns = [name for name in experiment.METRICS if name != column]
+    columns = [name for name in METRICS if name != column]
     rows = [",".join(columns), ",".join("1" for _ in columns), ""]
     (tmp_path / "metrics.csv").write_text("\n".join(rows))
     with pytest.raises(ValueError, match=rf"metrics\.csv: no column {column}$"):
@@ -475,16 +480,16 @@ def test_commit_says_whether_the_code_was_changed(tmp_path, monkeypatch):
     (tmp_path / "code.py").write_text("1\n")
     git("add", "code.py")
     git("commit", "-q", "-m", "first")
-    monkeypatch.setattr(runs, "__file__", str(tmp_path / "code.py"))
-    assert runs.git_commit() == git("rev-parse", "HEAD")
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "code.py"))
+    assert provenance.git_commit() == git("rev-parse", "HEAD")
     (tmp_path / "code.py").write_text("2\n")
-    assert runs.git_commit() == git("rev-parse", "HEAD") + "+changes"
+    assert provenance.git_commit() == git("rev-parse", "HEAD") + "+changes"
 
 
 def test_signals_are_as_before_afterwards():
     """Whoever trains as part of a larger program has its own handlers of signals back."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with runs.StopSignals():
+    with StopSignals():
         assert all(signal.getsignal(number) != own for number, own in handlers.items())
     assert {number: signal.getsignal(number) for number in handlers} == handlers
 
@@ -517,13 +522,13 @@ def test_rows_of_the_table(tmp_path, monkeypatch, preset):
     small = {"hidden_units": 8, "learning_starts": 5, "batch_size": 4, "max_cycles": 10}
     counts = {"n_problems": 4, "episodes_per_problem": 1, "evaluation_problems": 4}
     played = {}
-    real = experiment.evaluate
+    real = train.evaluate
 
     def evaluated(policy, setting, problems, *others, **more):
         played[more["progress"]] = policy, problems
         return real(policy, setting, problems, *others, **more)
 
-    monkeypatch.setattr(experiment, "evaluate", evaluated)
+    monkeypatch.setattr(train, "evaluate", evaluated)
     args = preset_options(
         meta_dqn.Args,
         preset,

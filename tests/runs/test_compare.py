@@ -14,10 +14,10 @@ from scipy import stats
 
 from baselines import compare, independent_dqn, meta_dqn
 from baselines.compare import Args
-from baselines.learning import experiment
-from baselines.learning import study as studies
+from baselines.learning import study, summary
 from baselines.learning.config import parse_options
-from baselines.learning.study import MEASURES, Interval, format_interval, interval
+from baselines.learning.summary import MEASURES, Interval, format_interval, interval
+from baselines.learning.training import Training
 from baselines.policies import figures
 
 WORDS = [
@@ -46,9 +46,9 @@ def compared(tmp_path_factory):
     """Return the folder of a tiny comparison, one of whose runs had been stopped half-way."""
     out = tmp_path_factory.mktemp("compared")
     stopped = out / "paper-shared-seed1"
-    words = ["--preset", "paper", "--seed", "1", "--share-parameters", "--no-prefetch", *WORDS]
+    words = ["--preset", "paper", "--seed", "1", "--share-parameters", *WORDS]
     options = parse_options(independent_dqn.Args, "", [*words, "--out", str(stopped)])
-    advance, calls = experiment.Training.advance, []
+    advance, calls = Training.advance, []
 
     def interrupted(self):
         calls.append(None)
@@ -57,7 +57,7 @@ def compared(tmp_path_factory):
         return advance(self)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment.Training, "advance", interrupted)
+        patch.setattr(Training, "advance", interrupted)
         assert independent_dqn.main(options) == 128 + signal.SIGTERM
     # And one was killed before it had written what it is.
     begun = out / "paper-meta-seed1"
@@ -76,7 +76,7 @@ def test_finished_runs_are_not_repeated(compared, monkeypatch, capsys):
     def refuse(*arguments, **options):
         raise AssertionError("a process was started")
 
-    monkeypatch.setattr(studies.subprocess, "Popen", refuse)
+    monkeypatch.setattr(study.subprocess, "Popen", refuse)
     assert compare.main(tiny(compared), WORDS) == 0
     assert "4 of 4 trainings were finished already" in capsys.readouterr().out
     assert [(compared / name).read_bytes() for name in names] == before
@@ -88,7 +88,7 @@ def test_stopped_run_is_resumed(compared, tmp_path):
     log = (compared / "paper-shared-seed1.log").read_text()
     assert "going on from episode" in log
     assert "going on" not in (compared / "paper-shared-seed0.log").read_text()
-    words = ["--preset", "paper", "--seed", "1", "--share-parameters", "--no-prefetch", *WORDS]
+    words = ["--preset", "paper", "--seed", "1", "--share-parameters", *WORDS]
     whole = parse_options(independent_dqn.Args, "", [*words, "--out", str(tmp_path / "whole")])
     assert independent_dqn.main(whole) == 0
     for name in ("metrics.csv", "policy.safetensors", "evaluation.csv"):
@@ -165,8 +165,8 @@ def test_what_another_is_about_to_train_is_left_alone(tmp_path):
 def test_updates_of_the_default_preset_can_be_fewer(tmp_path):
     """They are set for that preset alone."""
     args = tiny(tmp_path, presets=("default", "paper"), default_updates=7)
-    trials = compare.plan_trials(args, [])
-    updates = {trial.group[0]: trial.options.updates_per_episode for trial in trials}
+    runs = args.plan([])
+    updates = {run.group[0]: run.options.updates_per_episode for run in runs}
     assert updates == {"default": 7, "paper": 0}
     with pytest.raises(ValueError, match=r"default_updates has no effect with presets .*paper"):
         tiny(tmp_path, default_updates=7)
@@ -195,21 +195,21 @@ def test_failed_training_is_reported(tmp_path, monkeypatch):
 
 def test_a_signal_stops_all_trainings(tmp_path, monkeypatch, capsys):
     """Exit code 143, no process left behind, and the comparison can go on."""
-    started, start = [], studies.start
+    started, start = [], study.Run.start
 
-    def starting(trial):
-        process = start(trial)
+    def starting(run):
+        process = start(run)
         started.append(process)
         os.kill(os.getpid(), signal.SIGTERM)
         return process
 
-    monkeypatch.setattr(studies, "start", starting)
+    monkeypatch.setattr(study.Run, "start", starting)
     assert compare.main(tiny(tmp_path, learners=("meta",)), WORDS) == 128 + signal.SIGTERM
     assert len(started) == 1
     assert started[0].returncode is not None
     assert "the same command goes on" in capsys.readouterr().out
     # Whatever state it was stopped in is one that a later call takes up.
-    compare.plan_trials(tiny(tmp_path, learners=("meta",)), WORDS)
+    tiny(tmp_path, learners=("meta",)).plan(WORDS)
     shutil.rmtree(tmp_path)
 
 
@@ -262,9 +262,9 @@ def test_empty_and_double_choices_are_refused(name):
 
 def test_every_learner_takes_the_presets():
     """Each learner's options start from each preset and keep to it."""
-    for _, kind, own in compare.LEARNERS.values():
+    for script, own in compare.LEARNERS.values():
         for preset in ("default", "paper"):
-            options = parse_options(kind, "", ["--preset", preset, *own])
+            options = parse_options(script.Args, "", ["--preset", preset, *own])
             assert options.preset == preset
             assert getattr(options, "share_parameters", False) == bool(own)
     assert meta_dqn.ALGORITHM != independent_dqn.ALGORITHM
@@ -273,27 +273,26 @@ def test_every_learner_takes_the_presets():
 # -- what is read, and what is drawn -----------------------------------------------------------
 
 
-def finished_trial(out, seed, solved, learner="meta"):
-    """Return a trial with files as if it had been trained for 150 episodes and evaluated."""
+def finished_run(out, seed, solved, learner="meta"):
+    """Return a run with files as if it had been trained for 150 episodes and evaluated."""
     args = tiny(out / f"{learner}{seed}", learners=(learner,), seeds=seed + 1)
-    trials = compare.plan_trials(args, WORDS)
-    trial = next(trial for trial in trials if trial.seed == seed)
-    trial.folder.mkdir(parents=True)
+    run = next(run for run in args.plan(WORDS) if run.seed == seed)
+    run.folder.mkdir(parents=True)
     header = "policy,problems,solved %,gap %,optimal %,unsolved = 15\n"
     gap = "nan" if solved == 0 else "8.0"
-    (trial.folder / "evaluation.csv").write_text(
+    (run.folder / "evaluation.csv").write_text(
         f"{header}nearest landmark,30,100,1,2,3\nnetwork alone,30,{solved},{gap},1.5,{9 + seed}\n"
     )
-    (trial.folder / "timing.json").write_text('{"seconds_total": 90.0}')
+    (run.folder / "timing.json").write_text('{"seconds_total": 90.0}')
     rows = [f"{i + 1},1,15,{-i},{i % 2},1,0,0," for i in range(150)]
     text = "episode,problem,steps,reward,solved,epsilon,guidance,updates,loss\n"
-    (trial.folder / "metrics.csv").write_text(text + "\n".join(rows) + "\n")
-    return trial
+    (run.folder / "metrics.csv").write_text(text + "\n".join(rows) + "\n")
+    return run
 
 
 def test_an_outcome_is_what_the_files_say(tmp_path):
     """Figures are those of the network alone, the return that of the last hundred episodes."""
-    outcome = studies.read_outcome(finished_trial(tmp_path, 0, 50.0))
+    outcome = finished_run(tmp_path, 0, 50.0).outcome()
     assert outcome.measures == {
         "solved %": 50.0,
         "gap %": 8.0,
@@ -308,14 +307,14 @@ def test_an_outcome_is_what_the_files_say(tmp_path):
 def test_who_solves_nothing_has_no_gap(tmp_path):
     """The gap is summed up over those that have one, and it is said of how many."""
     outcomes = [
-        studies.read_outcome(finished_trial(tmp_path, seed, solved))
+        finished_run(tmp_path, seed, solved).outcome()
         for seed, solved in enumerate((0.0, 50.0, 70.0))
     ]
-    (summary,) = studies.summarise(outcomes)
-    assert summary.measures["gap %"].n == 2
-    assert summary.measures["gap %"].mean == 8.0
-    assert summary.measures["solved %"].n == 3
-    assert "8.00 [8.00, 8.00] (2 of 3)" in studies.format_study(compare.COLUMNS, [summary])
+    (group,) = summary.summarise(outcomes)
+    assert group.measures["gap %"].n == 2
+    assert group.measures["gap %"].mean == 8.0
+    assert group.measures["solved %"].n == 3
+    assert "8.00 [8.00, 8.00] (2 of 3)" in summary.format_study(compare.COLUMNS, [group])
 
 
 def test_interval_is_the_interquartile_means():
@@ -330,21 +329,21 @@ def test_all_learners_have_the_updates_asked_for(tmp_path):
     """The budget of the default preset is the same for every learner."""
     args = tiny(tmp_path, presets=("default",), learners=tuple(compare.LEARNERS), seeds=1)
     for default_updates in (7, 32):
-        trials = compare.plan_trials(replace(args, default_updates=default_updates), [])
-        assert [trial.group[1] for trial in trials] == list(compare.LEARNERS)
-        assert {t.options.updates_per_episode for t in trials} == {default_updates}
+        runs = replace(args, default_updates=default_updates).plan([])
+        assert [run.group[1] for run in runs] == list(compare.LEARNERS)
+        assert {r.options.updates_per_episode for r in runs} == {default_updates}
 
 
 def test_curves_are_those_of_the_episodes(tmp_path, monkeypatch):
     """Drawn are running means over the seeds, at the episodes that they end with, in per cent."""
     outcomes = [
-        studies.read_outcome(finished_trial(tmp_path, seed, 50.0, learner))
+        finished_run(tmp_path, seed, 50.0, learner).outcome()
         for learner in ("meta", "shared")
         for seed in (0, 1)
     ]
     drawn = []
     monkeypatch.setattr(figures, "_save", lambda figure, path: drawn.append(figure) or path)
-    compare.draw(tmp_path, studies.summarise(outcomes))
+    compare.draw(tmp_path, summary.summarise(outcomes))
     returns, solved, shares, gaps = drawn[0].axes
     for axes in (returns, solved):
         assert [line.get_label() for line in axes.lines] == ["meta", "shared"]
