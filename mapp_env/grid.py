@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.map_format import MAX_SIDE, MapError, ParsedMap, parse_map, read_map
-from mapp_env.validation import as_integer, describe
+from mapp_env.validation import as_array, as_integer, describe
 
 __all__ = ["FAR", "MAX_ALL_PAIRS_CELLS", "Grid"]
 
@@ -65,11 +65,7 @@ class Grid:
         depot: int
 
     def __init__(self, walls: ArrayLike, depot: object = None) -> None:
-        try:
-            known = isinstance(walls, np.ndarray | list | tuple)
-            array = np.array(walls if known else None, order="C")
-        except ValueError:
-            array = np.array(None)  # ragged
+        array = as_array(walls if isinstance(walls, np.ndarray | list | tuple) else None)
         if array.ndim != 2 or array.dtype != np.bool_:
             raise ValueError(
                 f"walls must be a two-dimensional array of bool, got {describe(walls)}"
@@ -80,6 +76,7 @@ class Grid:
             )
         if array.all():
             raise ValueError("walls must leave at least one free cell, got walls everywhere")
+        array = array.copy()
         array.flags.writeable = False
         object.__setattr__(self, "walls", array)
         cell = self._centre() if depot is None else self.cell("depot", depot)

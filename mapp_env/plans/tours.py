@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapp_env.engine.state import WAIT
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
-from mapp_env.validation import as_integer, describe
+from mapp_env.validation import as_array, as_integer, describe
 
 __all__ = ["check_tours", "moves_of", "tour_of", "tour_through", "walk_tours"]
 
@@ -136,10 +136,7 @@ def check_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> None:
 
 def _as_cells(n_cells: int, name: str, tour: Sequence[int]) -> NDArray[np.int64]:
     """Return a tour as an array; tours may be long."""
-    try:
-        cells = np.asarray(tour)
-    except ValueError:
-        cells = np.array(None)  # ragged
+    cells = as_array(tour)
     if cells.ndim == 1 and cells.dtype.kind in "iu" and 0 <= cells.min() <= cells.max() < n_cells:
         return cells.astype(np.int64)
     wrong = next((cell for cell in tour if as_integer(cell) not in range(n_cells)), tour)

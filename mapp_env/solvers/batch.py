@@ -14,7 +14,7 @@ from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
 from mapp_env.solvers.held_karp import Steps, route_costs, shortest_routes
 from mapp_env.solvers.solution import cell_distances, team_of
-from mapp_env.validation import check_choice, check_count, describe
+from mapp_env.validation import as_array, check_choice, check_count, describe
 
 __all__ = ["MAX_BATCH_LANDMARKS", "optimal_costs", "solve_universe"]
 
@@ -180,10 +180,7 @@ def _check(grid: object, n_agents: object, objective: object) -> None:
 
 def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
     """Return landmarks as cells (P, K), each row a problem by rule R2."""
-    try:
-        rows = np.asarray(landmarks)
-    except ValueError:  # ragged
-        rows = np.empty(0)
+    rows = as_array(landmarks)
     whole = rows.ndim == 2 and rows.dtype.kind in "iu"
     if not whole or not 1 <= rows.shape[1] <= MAX_BATCH_LANDMARKS:
         raise ValueError(
