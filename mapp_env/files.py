@@ -43,21 +43,10 @@ class FileError(ValueError):
 def read_bytes(
     path: str | os.PathLike[str], limit: int, what: str, error_type: type[ValueError]
 ) -> bytes:
-    """Return the content of a regular file.
+    """Return the content of a regular file of at most ``limit`` bytes.
 
     Nothing is read before the file is known to be regular, so that a pipe or a device cannot
-    block.
-
-    Parameters
-    ----------
-    path : str or os.PathLike
-        The file.
-    limit : int
-        Largest size in bytes.
-    what : str
-        How messages call such a file: "a map file".
-    error_type : type
-        What is raised.
+    block. Messages call such a file ``what``: "a map file".
 
     Raises
     ------
@@ -112,16 +101,8 @@ def read_json(
 def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = FileError) -> Any:
     """Return the value of a strict JSON text, UTF-8 if it is bytes.
 
-    Numbers are finite, and no object has a key twice: two readers could differ on it.
-
-    Parameters
-    ----------
-    data : str or bytes
-        The text; its size is for the caller to limit.
-    where : object
-        How messages call it: a path.
-    error_type : type
-        What is raised.
+    Numbers are finite, and no object has a key twice: two readers could differ on it. How large
+    the text may be is for the caller to say; messages call it ``where``.
 
     Raises
     ------
@@ -131,7 +112,7 @@ def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = 
     try:
         return json.loads(
             data if isinstance(data, str) else data.decode("utf-8"),
-            object_pairs_hook=unique_fields,
+            object_pairs_hook=_unique_fields,
             parse_constant=_finite,
             parse_float=_finite,
         )
@@ -141,7 +122,7 @@ def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = 
         raise error_type(f"{where}: is not strict JSON: {error}") from error
 
 
-def unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object of JSON, but refuse one with a key twice."""
     fields = dict(pairs)
     if len(fields) < len(pairs):
@@ -173,22 +154,15 @@ def write_text(path: str | os.PathLike[str], text: str, limit: int) -> None:
 def write_bytes(path: str | os.PathLike[str], data: bytes, limit: int) -> None:
     """Write a file whole or not at all: beside it first, then in its place.
 
-    A file that was there keeps its mode; of a link, what it leads to is replaced; another name of
-    the same file (a hard link) keeps the old content.
-
-    Parameters
-    ----------
-    path : str or os.PathLike
-        The file; if it is there it must be a regular one that its owner may write.
-    data : bytes
-        Its content.
-    limit : int
-        Largest size in bytes.
+    A file that was there, which must be a regular one that its owner may write, keeps its mode; of
+    a link, what it leads to is replaced; another name of the same file (a hard link) keeps the old
+    content.
 
     Raises
     ------
     FileError
-        If there is too much or the file cannot be written; an earlier file is left as it was.
+        If there are more than ``limit`` bytes or the file cannot be written; an earlier file is
+        left as it was.
     """
     target = check_writable(path)
     if len(data) > limit:

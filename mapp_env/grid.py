@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.map_format import MAX_SIDE, MapError, ParsedMap, parse_map, read_map
-from mapp_env.validation import as_integer, describe
+from mapp_env.validation import as_array, as_integer, describe
 
 __all__ = ["FAR", "MAX_ALL_PAIRS_CELLS", "Grid"]
 
@@ -65,18 +65,10 @@ class Grid:
         depot: int
 
     def __init__(self, walls: ArrayLike, depot: object = None) -> None:
-        if not isinstance(walls, np.ndarray | list | tuple):
-            raise ValueError(
-                f"walls must be a two-dimensional array of bool, got {describe(walls)}"
-            )
-        try:
-            array = np.asarray(walls)
-        except ValueError:
-            array = np.array(None)  # ragged
+        array = as_array(walls if isinstance(walls, np.ndarray | list | tuple) else None)
         if array.ndim != 2 or array.dtype != np.bool_:
             raise ValueError(
-                "walls must be a two-dimensional array of bool, "
-                f"got shape {array.shape} and dtype {array.dtype}"
+                f"walls must be a two-dimensional array of bool, got {describe(walls)}"
             )
         if not all(1 <= side <= MAX_SIDE for side in array.shape):
             raise ValueError(
@@ -124,17 +116,14 @@ class Grid:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], depot: object = None) -> Grid:
-        """Read a grid from a text or MovingAI ``.map`` file of at most 1 MiB.
-
-        A text file has a line for each row: ``#``, ``@``, ``T`` or ``O`` is a wall, ``.`` or ``G``
-        a free cell, ``D`` the depot.
+        """Read a grid from a file of at most 1 MiB: rows of characters, or a MovingAI ``.map``.
 
         Parameters
         ----------
         path : str or os.PathLike
             The file.
         depot : int or (int, int), optional
-            Overrides the file's depot; without either, the free cell nearest to the centre.
+            As for :meth:`from_text`.
 
         Raises
         ------
@@ -142,10 +131,7 @@ class Grid:
             If the file cannot be opened, is not a regular file, is too large or is malformed; the
             message names path and line.
         """
-        try:
-            source = os.fspath(path)
-        except TypeError:
-            source = None
+        source = os.fspath(path) if isinstance(path, str | os.PathLike) else None
         if not isinstance(source, str):
             raise ValueError(f"path must be a str or os.PathLike of one, got {describe(path)}")
         return cls._from_parsed(read_map(source), depot, source)
@@ -179,14 +165,7 @@ class Grid:
         return int(self.walls.size)
 
     def cell(self, name: str, value: object) -> int:
-        """Return the cell meant by an index or a (row, col) pair.
-
-        Parameters
-        ----------
-        name : str
-            How messages call the value.
-        value : int or (int, int)
-            A cell, or its row and column.
+        """Return the cell meant by an index or a (row, col) pair; ``name`` is for messages.
 
         Raises
         ------
@@ -267,15 +246,7 @@ class Grid:
     def distances_from(self, cells: Iterable[int]) -> NDArray[np.int32]:
         """Return the steps of a shortest path from each of ``cells`` to every cell.
 
-        Parameters
-        ----------
-        cells : iterable of int, length S
-            The starting cells; from a wall nothing is reachable.
-
-        Returns
-        -------
-        ndarray of int32, shape (S, C)
-            -1 where there is no path.
+        Shape (S, C) int32; -1 where there is no path, so in all of a wall's line.
 
         Raises
         ------
@@ -349,18 +320,10 @@ def fill_distances(
     queue: NDArray[np.int32],
     stop: int = -1,
 ) -> None:
-    """Breadth-first search: write the steps from ``start`` to every cell into ``steps``.
+    """Breadth-first search: write the steps from a free cell to every cell, shape (C,).
 
-    Parameters
-    ----------
-    moves : ndarray of int32, shape (C, >= 4)
-        Next cell of each move.
-    start : int
-        A free cell.
-    steps, queue : ndarray of int32, shape (C,)
-        The result, -1 where unreachable, and scratch space.
-    stop : int
-        A cell beyond which no distances are needed; those of all nearer ones are complete.
+    They are -1 where unreachable. ``queue``, shape (C,), is scratch space. Beyond ``stop`` no
+    distances are needed; those of all nearer cells are complete.
     """
     steps[:] = -1
     steps[start] = 0

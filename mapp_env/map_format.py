@@ -44,18 +44,12 @@ class ParsedMap(NamedTuple):
 
 
 def read_map(source: str) -> ParsedMap:
-    """Read a map file.
-
-    Parameters
-    ----------
-    source : str
-        Path of a regular file of at most ``MAX_FILE_BYTES`` bytes.
+    """Read a map file of at most ``MAX_FILE_BYTES`` bytes.
 
     Raises
     ------
     MapError
-        If the file cannot be opened, is not a regular file, is too large or is malformed. Nothing
-        is read before the file is known to be regular, so that a pipe or a device cannot block.
+        If the file cannot be opened, is not a regular file, is too large or is malformed.
     """
     data = read_bytes(source, MAX_FILE_BYTES, "a map file", MapError)
     data = data.removeprefix(codecs.BOM_UTF8)  # as editors of some systems write it
@@ -90,14 +84,10 @@ def parse_map(text: str, source: str = "text") -> ParsedMap:
     lines = re.split(r"\r\n|\r|\n", text.removeprefix("\ufeff"))
     if not all(line.endswith((" ", "\t")) for line in lines if line):
         lines = [line.rstrip(" \t") or line for line in lines]
-    first = 0
-    while first < len(lines) and not lines[first]:
-        first += 1
-    last = len(lines)
-    while last > first and not lines[last - 1]:
-        last -= 1
-    if first == last:
+    rows = [index for index, line in enumerate(lines) if line]
+    if not rows:
         raise MapError(f"{source}:1: holds no rows")
+    first, last = rows[0], rows[-1] + 1
     if lines[first].split()[:1] == ["type"]:
         height, width, first = _read_header(lines, first, source)
         if last - first != height:

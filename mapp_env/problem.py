@@ -145,18 +145,9 @@ def check_grid(name: str, value: object) -> Grid:
 def check_landmarks(
     grid: Grid, landmarks: object, count: int | None = None, name: str = "landmarks"
 ) -> tuple[int, ...]:
-    """Return ``landmarks`` as a tuple of cells that satisfy rule R2.
+    """Return ``landmarks``, cells or their rows and columns, as cells that satisfy rule R2.
 
-    Parameters
-    ----------
-    grid : Grid
-        The grid they stand on.
-    landmarks : sequence of int or of (int, int)
-        The cells, or their rows and columns.
-    count : int, optional
-        How many there must be; by default any number from 1 to 256.
-    name : str
-        How messages call the argument.
+    There must be ``count`` of them, by default any number from 1 to 256; ``name`` is for messages.
 
     Raises
     ------
@@ -227,7 +218,7 @@ def sample_problems(
     check_count("seed", seed, 0, 2**63 - 1)
     if not isinstance(exclude, Iterable):
         raise ValueError(f"exclude must be a sequence of landmark sets, got {describe(exclude)}")
-    seen = {
+    taken = {
         tuple(sorted(check_landmarks(grid, landmarks, n_landmarks, f"exclude[{index}]")))
         for index, landmarks in enumerate(exclude)
     }
@@ -237,16 +228,16 @@ def sample_problems(
             f"hold one; got {n_landmarks}"
         )
     total = math.comb(grid.reachable.size, n_landmarks)
-    if n_problems > total - len(seen):
+    if n_problems > total - len(taken):
         raise ValueError(
-            f"n_problems must be at most {total - len(seen)}, the number of problems with "
+            f"n_problems must be at most {total - len(taken)}, the number of problems with "
             f"{n_landmarks} landmarks on this grid that are not excluded; got {n_problems}"
         )
     rng = np.random.default_rng(seed)
-    if total <= MAX_LISTED and total <= 4 * (n_problems + len(seen)):
+    if total <= MAX_LISTED and total <= 4 * (n_problems + len(taken)):
         # So few problems that drawing until enough distinct ones turn up could take long.
         every = combinations(grid.reachable.tolist(), n_landmarks)
-        left = np.array([landmarks for landmarks in every if landmarks not in seen], np.int32)
+        left = np.array([landmarks for landmarks in every if landmarks not in taken], np.int32)
         return left[rng.permutation(len(left))[:n_problems]]
     problems = np.empty((n_problems, n_landmarks), dtype=np.int32)
     drawn = np.empty(n_landmarks, dtype=np.int32)
@@ -254,29 +245,20 @@ def sample_problems(
         while True:
             draw_landmarks(rng.integers(2**64, dtype=np.uint64), grid.reachable, drawn)
             landmarks = tuple(drawn.tolist())
-            if landmarks not in seen:
+            if landmarks not in taken:
                 break
-        seen.add(landmarks)
+        taken.add(landmarks)
         row[:] = drawn
     return problems
 
 
 @kernel
 def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[np.int32]) -> None:
-    """Choose distinct cells, every set equally likely, as a function of one random word.
+    """Choose distinct ones of ascending cells, every set equally likely, by one random word.
 
     Floyd's sampling (Bentley and Floyd 1987, doi:10.1145/30401.315746), then sorted: landmarks are
-    a set, and a set should have one observation, not ``K!``.
-
-    Parameters
-    ----------
-    word : uint64
-        The only source of randomness, uniform. One word an episode lets each row of a batch draw
-        from its own ``numpy.random.Generator`` without calling it from compiled code.
-    candidates : ndarray of int32, shape (F,)
-        Cells to choose from, ascending.
-    out : ndarray of int32, shape (K,), K <= F
-        The chosen cells, ascending.
+    a set, and a set should have one observation, not ``K!``. One word an episode lets each row of
+    a batch draw from its own ``numpy.random.Generator`` without calling it from compiled code.
     """
     high = np.int64(word >> np.uint64(32))
     low = np.int64(word & np.uint64(LOW_32_BITS))
@@ -290,7 +272,7 @@ def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[
         span = last + 1
         pick, multiple = 0, LOW_32_BITS
         while multiple > LOW_32_BITS + 1 - span:
-            bits = _scramble(_scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
+            bits = scramble(scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
             used += 1
             pick = bits % span
             multiple = bits - pick
@@ -307,13 +289,19 @@ def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[
         out[index] = candidates[out[index]]
 
 
-@kernel
-def _scramble(state: int) -> int:
-    """Return a 32-bit permutation of ``state`` (PCG RXS-M-XS; O'Neill 2014, HMC-CS-2014-0905).
+# A 32-bit PCG RXS-M-XS (O'Neill 2014, HMC-CS-2014-0905) in 64-bit signed arithmetic that never
+# overflows, so that it means the same with and without compilation.
 
-    Written in 64-bit signed arithmetic that never overflows, so that it means the same with and
-    without compilation.
-    """
-    state = (state * 747796405 + 2891336453) & LOW_32_BITS
+
+@kernel
+def next_word(word: int) -> int:
+    """Return the generator's state after ``word``."""
+    return (word * 747796405 + 2891336453) & LOW_32_BITS
+
+
+@kernel
+def scramble(word: int) -> int:
+    """Return a permutation of 32 bits: the generator's output after ``word``."""
+    state: int = next_word(word)
     state = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & LOW_32_BITS
     return (state >> 22) ^ state

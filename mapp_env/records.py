@@ -42,12 +42,7 @@ MAX_INTEGER = 2**53 - 1  # what every reader of JSON keeps exactly
 class Record:
     """An object of a file, of which each field is taken once.
 
-    Parameters
-    ----------
-    where : str
-        How messages call it: the path, and the field it stands in.
-    fields : dict
-        Its fields.
+    ``where`` is how messages call it: the path, and the field it stands in.
     """
 
     def __init__(self, where: str, fields: dict[str, Any]) -> None:
@@ -152,21 +147,9 @@ def _shown(value: object) -> str:
 
 
 def read_record(path: str | os.PathLike[str], kind: str, limit: int) -> Record:
-    """Read a file of one JSON object and check what it says it is.
+    """Return the fields of a "problem" or "plan" file of at most ``limit`` bytes.
 
-    Parameters
-    ----------
-    path : str or os.PathLike
-        A regular file.
-    kind : str
-        What it must be: "problem" or "plan".
-    limit : int
-        Largest size in bytes.
-
-    Returns
-    -------
-    Record
-        The fields but for ``format`` and ``version``.
+    All but ``format`` and ``version``, which are checked.
 
     Raises
     ------

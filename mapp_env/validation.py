@@ -9,9 +9,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 __all__ = [
     "MAX_SEED",
+    "as_array",
     "as_integer",
     "as_real",
     "check_choice",
@@ -54,6 +56,14 @@ def as_integer(value: object) -> int | None:
         return operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         return None
+
+
+def as_array(value: Any) -> NDArray[Any]:
+    """Return ``value`` as an array; one without axes if it is ragged or nested too deep."""
+    try:
+        return np.asarray(value)
+    except (ValueError, RecursionError):
+        return np.array(None)
 
 
 def as_real(value: object) -> float | None:

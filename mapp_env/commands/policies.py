@@ -124,11 +124,7 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
             f"{tell_apart(problem.grid, grid)}"
         )
     env = CentralEnv(
-        problem.grid,
-        problem.n_agents,
-        len(problem.landmarks),
-        max_cycles,
-        central_action="multi",
+        problem.grid, problem.n_agents, len(problem.landmarks), max_cycles, central_action="multi"
     )
     observation, _ = env.reset(seed=0, options={"landmarks": problem.landmarks})
     actions, over = [], False

@@ -72,9 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
     )
     parser.add_argument(
-        "--objective",
-        choices=OBJECTIVES,
-        help="what the optimum minimises (default cover_time)",
+        "--objective", choices=OBJECTIVES, help="what the optimum minimises (default cover_time)"
     )
     parser.add_argument(
         "--max-cycles",

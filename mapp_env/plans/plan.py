@@ -16,7 +16,7 @@ from mapp_env.plans.replay import Episode, check_joint_actions, play_episode
 from mapp_env.plans.tours import check_tours, moves_of, tour_of, walk_tours
 from mapp_env.problem import MAX_CYCLES, Problem
 from mapp_env.records import MAX_INTEGER, MAX_PLAN_BYTES, Record, read_record, write_record
-from mapp_env.validation import as_integer, as_real, check_choice, describe
+from mapp_env.validation import as_real, check_choice, check_count, describe
 
 __all__ = ["OBJECTIVES", "STATUSES", "Plan", "replay"]
 
@@ -26,7 +26,10 @@ STATUSES = ("optimal", "feasible", "infeasible")
 MAX_SOLVER_LETTERS = 100
 
 MAX_LISTED_CELLS = 100_000
-"""Most cells that a file lists, all tours together; in a larger plan, a tour is its moves."""
+"""Most cells that a file lists, all tours together; in a larger plan, a tour is its moves.
+
+A file must hold what a solver finds; a cell takes up to eight letters, a move one.
+"""
 
 
 @dataclass(frozen=True)
@@ -204,11 +207,8 @@ class Plan:
             raise ValueError(
                 f"plan: seconds must be a number in 0..{MAX_INTEGER}, got {describe(self.seconds)}"
             )
-        bound = None if self.bound is None else as_integer(self.bound)
-        if self.bound is not None and (bound is None or not 0 <= bound <= MAX_INTEGER):
-            raise ValueError(
-                f"plan: bound must be an integer in 0..{MAX_INTEGER}, got {describe(self.bound)}"
-            )
+        if self.bound is not None:
+            check_count("plan: bound", self.bound, 0, MAX_INTEGER)
 
     def _verify_status(self) -> None:
         if (self.status == "infeasible") == self.success:
@@ -250,6 +250,9 @@ class Plan:
         if len(episode.actions) > MAX_CYCLES:
             raise FileError(f"plan: has {len(episode.actions)} steps, a file holds {MAX_CYCLES}")
         # As played: what is equal but of another type, NumPy's integers say, is no JSON.
+        tours: Any = episode.tours
+        if sum(map(len, tours)) > MAX_LISTED_CELLS:
+            tours = [moves_of(problem.grid, tour) for tour in tours]
         columns = zip(*episode.actions, strict=True) if episode.actions else [()] * len(self.tours)
         return {
             "problem": problem.to_record(),
@@ -259,7 +262,7 @@ class Plan:
             "seconds": float(self.seconds),
             "bound": None if self.bound is None else int(self.bound),
             **json_costs(episode),
-            "tours": _spelled(problem, episode.tours),
+            "tours": tours,
             "claims": episode.claims,
             "claim_steps": episode.claim_steps,
             "actions": ["".join(map(str, column)) for column in columns],
@@ -310,16 +313,6 @@ class Plan:
         except ValueError as error:
             raise FileError(f"{source.where}: {error}") from error
         return plan
-
-
-def _spelled(problem: Problem, tours: tuple[tuple[int, ...], ...]) -> Any:
-    """Return tours as files hold them: their cells, or where these would be too many, their moves.
-
-    A file must hold what a solver finds; a cell takes up to eight letters, a move one.
-    """
-    if sum(map(len, tours)) <= MAX_LISTED_CELLS:
-        return tours
-    return [moves_of(problem.grid, tour) for tour in tours]
 
 
 def _read_tours(source: Record, problem: Problem, n_steps: int) -> tuple[tuple[int, ...], ...]:

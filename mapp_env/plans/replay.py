@@ -15,7 +15,7 @@ from mapp_env.engine.state import WAIT, Packed, World, new_rows, split_row
 from mapp_env.engine.task import make_world
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
-from mapp_env.validation import describe
+from mapp_env.validation import as_array, describe
 
 __all__ = ["Episode", "check_joint_actions", "play_episode"]
 
@@ -134,10 +134,7 @@ def check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]:
     ValueError
         If the shape is wrong or an action is not one.
     """
-    try:
-        array = np.asarray(joint_actions)
-    except (ValueError, RecursionError):
-        array = np.array(None)  # ragged, or nested too deep
+    array = as_array(joint_actions)
     if array.shape in ((0,), (0, n_agents)):
         return np.empty((0, n_agents), np.int64)
     if array.ndim != 2 or array.shape[1] != n_agents or array.dtype.kind not in "iu":

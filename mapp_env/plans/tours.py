@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapp_env.engine.state import WAIT
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
-from mapp_env.validation import as_integer, describe
+from mapp_env.validation import as_array, as_integer, describe
 
 __all__ = ["check_tours", "moves_of", "tour_of", "tour_through", "walk_tours"]
 
@@ -32,22 +32,20 @@ def walk_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> NDArray[np.i
     They end when every landmark is visited, or all tours are walked. An agent that is home earlier
     bumps into a wall, if the depot has one beside it; else it steps to and fro, never first on an
     unvisited landmark: the environment may have no action to wait, and nobody should claim more
-    than its tour.
+    than its tour. Where every neighbour of the depot is an unvisited landmark, an agent without a
+    tour follows the first step of one before it that has one (without such an agent it waits,
+    action 4), so idle agents should come last.
 
     Parameters
     ----------
     problem : Problem
         What is played; its step limit is ignored.
     tours : sequence of sequence of int
-        For each agent its cells from depot to depot, or nothing; neighbours in turn. Together they
-        visit every landmark. An agent without a tour should come after one that has one: where
-        every neighbour of the depot is an unvisited landmark, it follows that agent's first step
-        (without such an agent it waits, action 4).
+        For each agent its cells from depot to depot, or nothing; neighbours in turn.
 
     Returns
     -------
     ndarray of int64, shape (T, N)
-        Actions 0 to 3, but for the exception above.
     """
     grid = problem.grid
     # Who comes by each landmark first, and when; in one step, the agent of the lowest index.
@@ -138,10 +136,7 @@ def check_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> None:
 
 def _as_cells(n_cells: int, name: str, tour: Sequence[int]) -> NDArray[np.int64]:
     """Return a tour as an array; tours may be long."""
-    try:
-        cells = np.asarray(tour)
-    except ValueError:
-        cells = np.array(None)  # ragged
+    cells = as_array(tour)
     if cells.ndim == 1 and cells.dtype.kind in "iu" and 0 <= cells.min() <= cells.max() < n_cells:
         return cells.astype(np.int64)
     wrong = next((cell for cell in tour if as_integer(cell) not in range(n_cells)), tour)

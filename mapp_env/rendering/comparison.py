@@ -25,9 +25,7 @@ HEADING = 36.0  # points above the map, of the label
 
 
 def compare_plans(
-    problem: Problem,
-    plans: Mapping[str, Plan],
-    path: str | os.PathLike[str] | None = None,
+    problem: Problem, plans: Mapping[str, Plan], path: str | os.PathLike[str] | None = None
 ) -> Figure:
     """Draw plans of one problem side by side.
 

@@ -6,13 +6,14 @@ import io
 import math
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from mapp_env.files import FileError, check_writable, write_bytes
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.rendering.ground import NOT_VISITED, Signs, draw_ground
 from mapp_env.rendering.palette import INK, WALL, agent_colour, to_hex
 from mapp_env.rendering.routes import DASHES, draw_routes
@@ -91,23 +92,12 @@ class Panel:
 
     Laid out by hand: matplotlib's layout engines leave large gaps around axes that keep their cells
     square.
-
-    Parameters
-    ----------
-    grid : Grid
-        What is drawn.
-    n_agents : int
-        Entries of the legend.
-    large_side : float
-        Of the map, if it has many cells.
-    above : float
-        Room for the title.
     """
 
     grid: Grid
-    n_agents: int
-    large_side: float = MAX_LARGE_SIDE
-    above: float = 0.4
+    n_agents: int  # entries of the legend
+    large_side: float = MAX_LARGE_SIDE  # of the map, if it has many cells
+    above: float = 0.4  # for the title
 
     @property
     def map_size(self) -> tuple[float, float]:
@@ -196,11 +186,8 @@ def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
             entries.append(Line2D([], [], color=colour, linewidth=2.4, label=label))
         else:
             label = f"agent {agent}: claims nothing"
-            entries.append(
-                Line2D(
-                    [], [], color=colour, linestyle="none", marker="s", markersize=5, label=label
-                )
-            )
+            dot: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 5}
+            entries.append(Line2D([], [], color=colour, label=label, **dot))
     nothing = Line2D([], [], linestyle="none", label=" ")
     entries += [nothing] * (-len(entries) % LEGEND_COLUMNS)
     ink = to_hex(INK)
@@ -226,7 +213,7 @@ def costs_of(plan: Plan) -> str:
     if not plan.success:
         return "not every landmark is visited"
     parts = []
-    for name in ("cover_time", "makespan", "total_distance"):
+    for name in OBJECTIVES:
         proven = " (optimal)" if plan.status == "optimal" and plan.objective == name else ""
         parts.append(f"{name.replace('_', ' ')} {getattr(plan, name)}{proven}")
     return ", ".join(parts)

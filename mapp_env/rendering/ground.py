@@ -66,17 +66,12 @@ def draw_ground(ax: Axes, grid: Grid) -> None:
     )
     if max(grid.rows, grid.cols) <= OUTLINED_SIDE:
         free = ~grid.walls
+        upright, level = free[:, 1:] & free[:, :-1], free[1:] & free[:-1]
         lines = [
-            ((col + 0.5, row - 0.5), (col + 0.5, row + 0.5))
-            for row, col in np.argwhere(free[:, 1:] & free[:, :-1]).tolist()
-        ] + [
-            ((col - 0.5, row + 0.5), (col + 0.5, row + 0.5))
-            for row, col in np.argwhere(free[1:] & free[:-1]).tolist()
-        ]
-        ax.add_collection(
-            LineCollection(lines, colors=to_hex(GRID_LINE), linewidths=0.6, zorder=1),
-            autolim=False,
-        )
+            ((col + 0.5, row - 0.5), (col + 0.5, row + 0.5)) for row, col in np.argwhere(upright)
+        ] + [((col - 0.5, row + 0.5), (col + 0.5, row + 0.5)) for row, col in np.argwhere(level)]
+        outlines = LineCollection(lines, colors=to_hex(GRID_LINE), linewidths=0.6, zorder=1)
+        ax.add_collection(outlines, autolim=False)
 
 
 @dataclass(frozen=True)
@@ -86,20 +81,11 @@ class Signs:
     They stand above the routes, within a light line, as a route that runs into a flag is still
     seen to, but a flag under a bundle of routes is not. On cells that are smaller than a legible
     sign they reach over their neighbours, yet not over the border of the grid.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-        Where to draw.
-    grid : Grid
-        What stands where.
-    points : float
-        Side of a cell in points.
     """
 
     ax: Axes
     grid: Grid
-    points: float
+    points: float  # side of a cell
 
     def tint(self, cells: Iterable[int], of_depot: bool = False) -> None:
         """Tint cells that are large enough for it, under everything else."""

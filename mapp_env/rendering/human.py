@@ -51,12 +51,8 @@ class Window:
     def show(self, frame: NDArray[np.uint8], fps: int) -> None:
         """Show a frame, wait until the next one is due, and answer the user's events.
 
-        Parameters
-        ----------
-        frame : ndarray of uint8, shape (height, width, 3)
-            The picture; the window takes its size.
-        fps : int
-            Frames a second; 0 does not wait.
+        The window takes the size of ``frame``, shape (height, width, 3) uint8; with 0 frames a
+        second it does not wait.
 
         Raises
         ------

@@ -49,15 +49,9 @@ def disc(size: int, colour: Colour, label: str) -> Icon:
         rim = max(0.05 * s, OVERSAMPLING)
         pen.ellipse((rim, rim, s - 1 - rim, s - 1 - rim), fill=colour)
         if size >= 13:
-            height = 0.56 * s if len(label) == 1 else 0.48 * s
-            pen.text(
-                (s / 2, s / 2 + 0.01 * s),
-                label,
-                fill=ink_on(colour),
-                font=_font(height),
-                anchor="mm",
-                stroke_width=0.018 * s,
-            )
+            font = _font(0.56 * s if len(label) == 1 else 0.48 * s)
+            middle, ink = (s / 2, s / 2 + 0.01 * s), ink_on(colour)
+            pen.text(middle, label, fill=ink, font=font, anchor="mm", stroke_width=0.018 * s)
 
     return _icon(size, size, draw)
 
@@ -102,10 +96,7 @@ def house(size: int, plate: bool = False) -> Icon:
         if plate:
             _draw_plate(pen, s, DEPOT, DEPOT_CELL)
         pen.rectangle((0.22 * s, 0.46 * s, 0.78 * s, 0.86 * s), fill=DEPOT)
-        pen.polygon(
-            [(0.08 * s, 0.50 * s), (0.50 * s, 0.12 * s), (0.92 * s, 0.50 * s)],
-            fill=DEPOT,
-        )
+        pen.polygon([(0.08 * s, 0.5 * s), (0.5 * s, 0.12 * s), (0.92 * s, 0.5 * s)], fill=DEPOT)
         pen.rectangle((0.42 * s, 0.60 * s, 0.58 * s, 0.86 * s), fill=DEPOT_CELL)
 
     return _icon(size, size, draw)
@@ -118,14 +109,8 @@ def text(string: str, height: int, colour: Colour) -> Icon:
     width = -int(-font.getlength(string) // OVERSAMPLING)
 
     def draw(pen: ImageDraw, s: float) -> None:
-        pen.text(
-            (0, s / 2),
-            string,
-            fill=colour,
-            font=font,
-            anchor="lm",
-            stroke_width=0.01 * s,
-        )
+        middle = (0, s / 2)
+        pen.text(middle, string, fill=colour, font=font, anchor="lm", stroke_width=0.01 * s)
 
     return _icon(width, height, draw)
 

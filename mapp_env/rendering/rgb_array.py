@@ -121,10 +121,7 @@ class _Layout:
         """Return the point nearest to a cell's middle where an icon is not cut off by the frame."""
         down, right = self.centre(cell)
         half = size / 2
-        return (
-            min(max(down, half), self.height - half),
-            min(max(right, half), self.width - half),
-        )
+        return min(max(down, half), self.height - half), min(max(right, half), self.width - half)
 
 
 @lru_cache(maxsize=64)
@@ -136,14 +133,8 @@ def _layout(grid: Grid, n_landmarks: int, max_cycles: int, max_side: int) -> _La
     width = max(grid.cols * cell + 2 * MARGIN, bar_width, MIN_AREA[0])
     height = max(grid.rows * cell + 2 * MARGIN, MIN_AREA[1])
     width, height = width + width % 2, height + height % 2
-    return _Layout(
-        cell=cell,
-        left=(width - grid.cols * cell) // 2,
-        top=(height - grid.rows * cell) // 2,
-        width=width,
-        height=height,
-        cols=grid.cols,
-    )
+    left_edge, top = (width - grid.cols * cell) // 2, (height - grid.rows * cell) // 2
+    return _Layout(cell, left_edge, top, width, height, grid.cols)
 
 
 @lru_cache(maxsize=8)

@@ -34,19 +34,7 @@ Move: TypeAlias = tuple[int, int]
 
 
 def draw_routes(ax: Axes, grid: Grid, plan: Plan, points: float) -> None:
-    """Draw the tours of a plan.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-        Where to draw.
-    grid : Grid
-        What they run on.
-    plan : Plan
-        The tours and the claims.
-    points : float
-        Side of a cell in points, which the widths of lines are given in.
-    """
+    """Draw the tours of a plan; ``points`` is the side of a cell, in the unit of lines' widths."""
     lanes = _lanes(plan.tours)
     n_lanes = max(lanes) + 1
     spacing = min(max(LANE, LEAST_LANE / points), LANES / n_lanes)
@@ -170,32 +158,18 @@ def _draw_arrows(ax: Axes, route: _Route, width: float, points: float) -> None:
 
 def _shift(grid: Grid, middles: list[Point], offset: float) -> tuple[list[Point], list[int]]:
     """Move a route as a whole, yet not off the grid; returns what :func:`_keep_right` does."""
+    right, bottom = grid.cols - 0.5, grid.rows - 0.5
     corners = [
-        (
-            min(max(across + offset, -0.5), grid.cols - 0.5),
-            min(max(down + offset, -0.5), grid.rows - 0.5),
-        )
+        (min(max(across + offset, -0.5), right), min(max(down + offset, -0.5), bottom))
         for across, down in middles
     ]
     return corners, list(range(len(corners)))
 
 
 def _keep_right(middles: list[Point], offset: float) -> tuple[list[Point], list[int]]:
-    """Move a route to the right of its direction, as traffic does.
+    """Move a route through middles of neighbouring cells to the right, as traffic does.
 
-    Parameters
-    ----------
-    middles : list of (float, float), length M
-        The middles of neighbouring cells.
-    offset : float
-        How far to move, in cells.
-
-    Returns
-    -------
-    list of (float, float)
-        The corners of the moved route.
-    list of int, length M
-        At which corner the route leaves each cell.
+    Returns the corners of the moved route, and for each cell at which of them it leaves the cell.
     """
     # Down grows downwards, so the right of a heading (a, d) is (-d, a).
     headings = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(middles)]
@@ -206,12 +180,8 @@ def _keep_right(middles: list[Point], offset: float) -> tuple[list[Point], list[
     ):
         if into == (-out[0], -out[1]):  # turns back: around the end of the corridor's middle line
             for heading in (into, out):
-                corners.append(
-                    (
-                        across + offset * (into[0] - heading[1]),
-                        down + offset * (into[1] + heading[0]),
-                    )
-                )
+                away = (into[0] - heading[1], into[1] + heading[0])
+                corners.append((across + offset * away[0], down + offset * away[1]))
         else:
             straight = into == out
             right = (-into[1], into[0]) if straight else (-into[1] - out[1], into[0] + out[0])

@@ -8,10 +8,9 @@ from mapp_env.compiled import clock
 from mapp_env.plans.plan import OBJECTIVES, Plan, replay
 from mapp_env.plans.tours import tour_through, walk_tours
 from mapp_env.problem import Problem
-from mapp_env.solvers.batch import optimal_costs
+from mapp_env.solvers.batch import optimal_costs, solve_universe
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.solution import Solution, Solver
-from mapp_env.solvers.universe import solve_universe
 from mapp_env.solvers.vrplib import save_vrplib
 from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, describe
 

@@ -1,7 +1,8 @@
-"""The optimum of many problems at once: what a policy's costs are compared with."""
+"""The optimum of many problems at once, or of all of a grid: what policies are compared with."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,14 +12,20 @@ from mapp_env.compiled import kernel
 from mapp_env.grid import FAR, MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
-from mapp_env.solvers.held_karp import route_costs, shortest_routes
+from mapp_env.solvers.held_karp import Steps, route_costs, shortest_routes
 from mapp_env.solvers.solution import cell_distances, team_of
-from mapp_env.validation import check_choice, check_count, describe
+from mapp_env.validation import as_array, check_choice, check_count, describe
 
-__all__ = ["MAX_BATCH_LANDMARKS", "Workspace", "optimal_costs", "solve_rows"]
+__all__ = ["MAX_BATCH_LANDMARKS", "optimal_costs", "solve_universe"]
 
 MAX_BATCH_LANDMARKS = 12
 """Largest number of landmarks of each problem."""
+
+MAX_UNIVERSE_PROBLEMS = 10_000_000
+"""Largest number of problems of a grid: up to half a gigabyte of answers."""
+
+MAX_UNIVERSE_WORK = 20_000_000_000
+"""Largest number of them times ``3 ** n_landmarks``: some minutes."""
 
 CHUNK_WORK = 4_000_000  # between two chances to interrupt: some milliseconds
 
@@ -26,10 +33,10 @@ CHUNK_WORK = 4_000_000  # between two chances to interrupt: some milliseconds
 class Workspace(NamedTuple):
     """What solving one problem of K landmarks after another needs."""
 
-    between: NDArray[np.int32]  # (K + 1, K + 1)
-    routes: NDArray[np.int32]  # (2 ** K, K)
-    costs: NDArray[np.int32]  # (2 ** K,)
-    worst: NDArray[np.int32]  # (2, 2 ** (K - 1))
+    between: Steps  # (K + 1, K + 1)
+    routes: Steps  # (2 ** K, K)
+    costs: Steps  # (2 ** K,)
+    worst: Steps  # (2, 2 ** (K - 1))
 
     @classmethod
     def of(cls, n_landmarks: int) -> Workspace:
@@ -73,9 +80,7 @@ def optimal_costs(
         If an argument is invalid, or a row is not a problem of the grid (rule R2); the message
         names the row.
     """
-    check_grid("grid", grid)
-    check_count("n_agents", n_agents, 1, MAX_AGENTS)
-    check_choice("objective", objective, OBJECTIVES)
+    _check(grid, n_agents, objective)
     cells = _check_rows(grid, landmarks)
     n_problems, n_landmarks = cells.shape
     optimum = np.empty(n_problems, np.int32)
@@ -101,12 +106,81 @@ def optimal_costs(
     return optimum
 
 
+def solve_universe(
+    grid: Grid, n_landmarks: int = 5, n_agents: int = 3, objective: str = "cover_time"
+) -> tuple[NDArray[Any], NDArray[np.int32]]:
+    """Return every set of landmarks on a grid, with its proven optimum.
+
+    The same optimum as :func:`mapp_env.solve` with ``method="exact"``, for all problems at once.
+
+    Parameters
+    ----------
+    grid : Grid
+        The grid; F of its cells may hold a landmark.
+    n_landmarks : int
+        Landmarks K of each problem, 1 to 12.
+    n_agents : int
+        1 to 16.
+    objective : {"cover_time", "makespan", "total_distance"}
+        What is minimised.
+
+    Returns
+    -------
+    landmarks : ndarray of int16 (int32 on grids of more than 32,767 cells), shape (P, K)
+        All ``P = C(F, K)`` sets, each ascending, in lexicographic order.
+    optimum : ndarray of int32, shape (P,)
+        The smallest cost of each.
+
+    Raises
+    ------
+    ValueError
+        If there are no such problems, more than ten million, or too large ones for their number;
+        the message says how many, and nothing has been allocated.
+    """
+    _check(grid, n_agents, objective)
+    check_count("n_landmarks", n_landmarks, 1, MAX_BATCH_LANDMARKS)
+    cells = grid.reachable
+    n_problems = math.comb(len(cells), n_landmarks)
+    if n_problems == 0:
+        raise ValueError(
+            f"n_landmarks must be at most {len(cells)}, the cells of this grid that may hold one; "
+            f"got {n_landmarks}"
+        )
+    if n_problems > MAX_UNIVERSE_PROBLEMS or n_problems * 3**n_landmarks > MAX_UNIVERSE_WORK:
+        raise ValueError(
+            f"this grid has {n_problems:,} problems of {n_landmarks} landmarks; a universe "
+            f"takes at most {MAX_UNIVERSE_PROBLEMS:,}, and {MAX_UNIVERSE_WORK:,} problems times "
+            f"3 ** n_landmarks: use sample_problems() and solve()"
+        )
+    cell_type = np.int16 if grid.n_cells <= np.iinfo(np.int16).max else np.int32
+    teams, closed = team_of(objective, n_agents, n_landmarks)
+    if n_landmarks == 1:
+        # No distances between landmarks: a large grid would have too many.
+        return cells.astype(cell_type)[:, None], grid.home[cells] * (2 if closed else 1)
+    distances = cell_distances(grid, np.concatenate(([grid.depot], cells)))
+    landmarks = np.empty((n_problems, n_landmarks), cell_type)
+    optimum = np.empty(n_problems, np.int32)
+    workspace = Workspace.of(n_landmarks)
+    chosen = np.arange(n_landmarks)
+    chunk = max(1, CHUNK_WORK // 3**n_landmarks)
+    ranks = np.empty((min(chunk, n_problems), n_landmarks), np.int32)
+    for first in range(0, n_problems, chunk):
+        part = ranks[: n_problems - first]
+        list_sets(chosen, len(cells), part)
+        landmarks[first : first + chunk] = cells[part]
+        solve_rows(distances, part + 1, teams, closed, optimum[first : first + chunk], workspace)
+    return landmarks, optimum
+
+
+def _check(grid: object, n_agents: object, objective: object) -> None:
+    check_grid("grid", grid)
+    check_count("n_agents", n_agents, 1, MAX_AGENTS)
+    check_choice("objective", objective, OBJECTIVES)
+
+
 def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
     """Return landmarks as cells (P, K), each row a problem by rule R2."""
-    try:
-        rows = np.asarray(landmarks)
-    except ValueError:  # ragged
-        rows = np.empty(0)
+    rows = as_array(landmarks)
     whole = rows.ndim == 2 and rows.dtype.kind in "iu"
     if not whole or not 1 <= rows.shape[1] <= MAX_BATCH_LANDMARKS:
         raise ValueError(
@@ -130,11 +204,11 @@ def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
 
 @kernel
 def solve_rows(
-    distances: NDArray[np.int32],
+    distances: Steps,
     rows: NDArray[Any],
     teams: int,
     closed: bool,
-    optimum: NDArray[np.int32],
+    optimum: Steps,
     workspace: Workspace,
 ) -> None:
     """Fill in the ``optimum``, shape (p,), of each row of landmarks' nodes, shape (p, K).
@@ -156,7 +230,7 @@ def solve_rows(
 
 
 @kernel
-def least_worst(costs: NDArray[np.int32], teams: int, worst: NDArray[np.int32]) -> int:
+def least_worst(costs: Steps, teams: int, worst: Steps) -> int:
     """Return the smallest possible cost of the costliest of so many sets that hold everything.
 
     ``costs``, shape (2 ** K,), is what each set costs one agent; ``worst``, shape
@@ -190,3 +264,24 @@ def least_worst(costs: NDArray[np.int32], teams: int, worst: NDArray[np.int32]) 
     for part in range(half):
         least = min(least, max(costs[half | part], worst[fewer, (half - 1) ^ part]))
     return int(least)
+
+
+@kernel
+def list_sets(chosen: NDArray[np.int64], n_items: int, sets: Steps) -> None:
+    """Write sets of items, 0 to ``n_items - 1``, in lexicographic order: ``sets``, shape (p, K).
+
+    ``chosen``, shape (K,), is the first, ascending; left as the one after the last, if any.
+    """
+    n_chosen = chosen.shape[0]
+    last = n_items - n_chosen
+    for row in range(sets.shape[0]):
+        for place in range(n_chosen):
+            sets[row, place] = chosen[place]
+        place = n_chosen - 1
+        while place >= 0 and chosen[place] == last + place:
+            place -= 1
+        if place < 0:
+            return
+        chosen[place] += 1
+        for after in range(place + 1, n_chosen):
+            chosen[after] = chosen[after - 1] + 1

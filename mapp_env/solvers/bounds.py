@@ -9,7 +9,7 @@ from mapp_env.compiled import kernel
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem
 from mapp_env.solvers.exact import smallest_limit
-from mapp_env.solvers.held_karp import route_tables
+from mapp_env.solvers.held_karp import Steps, route_tables
 from mapp_env.solvers.solution import UNBOUNDED, team_of
 from mapp_env.validation import check_choice
 
@@ -23,7 +23,7 @@ SCALE = 1 << 10
 """Penalties are whole multiples of 1 / SCALE of a step, so that a bound has no rounding error."""
 
 
-def lower_bound(problem: Problem, objective: str, distances: NDArray[np.int32]) -> int:
+def lower_bound(problem: Problem, objective: str, distances: Steps) -> int:
     """Return a cost that no plan of a problem can beat; up to 12 landmarks it is the optimum.
 
     ``distances`` are from :func:`~mapp_env.solvers.solution.landmark_distances`.
@@ -38,7 +38,7 @@ def lower_bound(problem: Problem, objective: str, distances: NDArray[np.int32]) 
     return subset_bound(distances, teams, closed, tree_bound(distances, teams, closed))
 
 
-def tree_bound(distances: NDArray[np.int32], teams: int, closed: bool) -> int:
+def tree_bound(distances: Steps, teams: int, closed: bool) -> int:
     """Return a lower bound of the longest route of a team.
 
     It is the largest of
@@ -56,14 +56,14 @@ def tree_bound(distances: NDArray[np.int32], teams: int, closed: bool) -> int:
     farthest = int(distances[0].max()) * (2 if closed else 1)
     if n_nodes == 2:
         return farthest
-    scaled = ascend(distances, closed, teams, *np.zeros((4, n_nodes), np.int64))
+    scaled = ascend(distances, closed, teams, np.zeros((4, n_nodes), np.int64))
     spread = -(-int(scaled) // (SCALE * teams))
     if closed:
         spread += spread % 2
     return max(farthest, spread)
 
 
-def subset_bound(distances: NDArray[np.int32], teams: int, closed: bool, low: int) -> int:
+def subset_bound(distances: Steps, teams: int, closed: bool, low: int) -> int:
     """Return the optimum of 12 landmarks, or ``low`` if that is larger.
 
     With landmarks left out a plan is a plan still: no optimum falls with a landmark more. The
@@ -89,15 +89,7 @@ def subset_bound(distances: NDArray[np.int32], teams: int, closed: bool, low: in
 
 
 @kernel
-def ascend(
-    distances: NDArray[np.int32],
-    closed: bool,
-    n_agents: int,
-    penalties: NDArray[np.int64],
-    reach: NDArray[np.int64],
-    links: NDArray[np.int64],
-    degrees: NDArray[np.int64],
-) -> int:
+def ascend(distances: Steps, closed: bool, n_agents: int, nodes: NDArray[np.int64]) -> int:
     """Raise node penalties by subgradient steps; return the best bound found, times ``SCALE``.
 
     Parameters
@@ -109,14 +101,16 @@ def ascend(
         no degree above 2, the depot's not above ``n_agents``).
     n_agents : int
         Number of agents.
-    penalties, reach, links, degrees : ndarray of int64, shape (n,)
-        Zero on entry; the last three are scratch space.
+    nodes : ndarray of int64, shape (4, n)
+        The penalties, zero on entry, and scratch space for :func:`span`.
     """
+    penalties = nodes[0]
+    degrees = nodes[3]
     n_nodes = distances.shape[0]
     best = 0
     stride = 0
     for turn in range(ROUNDS):
-        weight = span(distances, closed, penalties, reach, links, degrees)
+        weight = span(distances, closed, nodes)
         for node in range(n_nodes):
             limit = 2 if closed or node > 0 else n_agents
             weight -= limit * penalties[node]
@@ -134,18 +128,12 @@ def ascend(
 
 
 @kernel
-def span(
-    distances: NDArray[np.int32],
-    closed: bool,
-    penalties: NDArray[np.int64],
-    reach: NDArray[np.int64],
-    links: NDArray[np.int64],
-    degrees: NDArray[np.int64],
-) -> int:
+def span(distances: Steps, closed: bool, nodes: NDArray[np.int64]) -> int:
     """Return the weight of a smallest spanning tree (Prim) under penalties, and its degrees.
 
     For a closed tour the tree spans the landmarks, and the depot joins it by its two best edges.
     """
+    penalties, reach, links, degrees = nodes[0], nodes[1], nodes[2], nodes[3]
     n_nodes = distances.shape[0]
     root = 1 if closed else 0
     total = 0

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.grid import FAR
 from mapp_env.problem import Problem
-from mapp_env.solvers.held_karp import route_tables, tours_within, trace_route
+from mapp_env.solvers.held_karp import Steps, route_tables, tours_within, trace_route
 from mapp_env.solvers.solution import Solution, landmark_distances, solution_of, team_of
 
 __all__ = ["MAX_EXACT_LANDMARKS", "smallest_limit", "solve_exact"]
@@ -79,7 +79,7 @@ def solve_exact(
 # -- how many agents are enough ------------------------------------------
 
 
-def smallest_limit(costs: NDArray[np.int32], teams: int, low: int = 0) -> int:
+def smallest_limit(costs: Steps, teams: int, low: int = 0) -> int:
     """Return the least limit, from ``low`` on, within which so many agents visit everything.
 
     Parameters
@@ -172,7 +172,7 @@ def sum_subsets(counts: NDArray[np.int64], sign: int) -> None:
 # -- who visits what -----------------------------------------------------
 
 
-def _split(tours: NDArray[np.int32], families: Families, teams: int) -> list[int]:
+def _split(tours: Steps, families: Families, teams: int) -> list[int]:
     """Return disjoint sets, one an agent, that hold everything with the least sum of tours.
 
     ``tours``, shape (2 ** K,), is what each set costs one agent, at least ``FAR`` if it cannot
@@ -198,7 +198,7 @@ def _split(tours: NDArray[np.int32], families: Families, teams: int) -> list[int
     return _trace_parts(tours, tables)
 
 
-def _trace_parts(tours: NDArray[np.int32], tables: Sequence[NDArray[np.int32]]) -> list[int]:
+def _trace_parts(tours: Steps, tables: Sequence[Steps]) -> list[int]:
     """Return the disjoint sets, one an agent, whose sum is the least by tables of sums."""
     left = len(tours) - 1
     parts = []
@@ -211,12 +211,7 @@ def _trace_parts(tours: NDArray[np.int32], tables: Sequence[NDArray[np.int32]]) 
 
 
 @kernel
-def add_agent(
-    tours: NDArray[np.int32],
-    sums: NDArray[np.int32],
-    wanted: NDArray[np.bool_],
-    more: NDArray[np.int32],
-) -> None:
+def add_agent(tours: Steps, sums: Steps, wanted: NDArray[np.bool_], more: Steps) -> None:
     """Fill in ``more``, the least sums of tours for one agent more, ``FAR`` where not wanted.
 
     ``sums`` are those so far, shape (2 ** (K - 1),) like all but ``tours``. They may be ``more``
@@ -243,7 +238,7 @@ def add_agent(
 
 
 @kernel
-def first_part(tours: NDArray[np.int32], sums: NDArray[np.int32], left: int) -> int:
+def first_part(tours: Steps, sums: Steps, left: int) -> int:
     """Return the set of the agent that visits the highest landmark left; among equals the last."""
     top = 1
     while 2 * top <= left:

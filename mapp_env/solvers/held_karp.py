@@ -6,18 +6,20 @@ Held and Karp 1962, doi:10.1137/0110015. A set is a number whose bit ``k`` stand
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.grid import FAR
 
-__all__ = ["route_costs", "route_tables", "shortest_routes", "tours_within", "trace_route"]
+__all__ = ["Steps", "route_costs", "route_tables", "shortest_routes", "tours_within", "trace_route"]
+
+Steps: TypeAlias = NDArray[np.int32]
 
 
-def route_tables(
-    distances: NDArray[np.int32], closed: bool
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def route_tables(distances: Steps, closed: bool) -> tuple[Steps, Steps]:
     """Return, for each set, the steps to each of its landmarks as the last, and its cost.
 
     As :func:`shortest_routes` and :func:`route_costs` fill them in, (2 ** K, K) and (2 ** K,).
@@ -31,7 +33,7 @@ def route_tables(
 
 
 @kernel
-def shortest_routes(distances: NDArray[np.int32], routes: NDArray[np.int32]) -> None:
+def shortest_routes(distances: Steps, routes: Steps) -> None:
     """Fill in the steps of the shortest way from the depot through each set of landmarks.
 
     Parameters
@@ -62,12 +64,7 @@ def shortest_routes(distances: NDArray[np.int32], routes: NDArray[np.int32]) -> 
 
 
 @kernel
-def route_costs(
-    distances: NDArray[np.int32],
-    routes: NDArray[np.int32],
-    closed: bool,
-    costs: NDArray[np.int32],
-) -> None:
+def route_costs(distances: Steps, routes: Steps, closed: bool, costs: Steps) -> None:
     """Fill in, for each set, the steps of one agent's shortest route, or closed tour, (2 ** K,)."""
     costs[0] = 0
     for members in range(1, costs.shape[0]):
@@ -81,13 +78,7 @@ def route_costs(
 
 
 @kernel
-def tours_within(
-    distances: NDArray[np.int32],
-    routes: NDArray[np.int32],
-    closed: bool,
-    limit: int,
-    tours: NDArray[np.int32],
-) -> None:
+def tours_within(distances: Steps, routes: Steps, closed: bool, limit: int, tours: Steps) -> None:
     """Fill in, for each set, the shortest closed tour within a limit, (2 ** K,), else ``FAR``.
 
     The limit holds for the closed tour, or for the way to its last landmark only.
@@ -105,12 +96,7 @@ def tours_within(
 
 @kernel
 def trace_route(
-    distances: NDArray[np.int32],
-    routes: NDArray[np.int32],
-    closed: bool,
-    limit: int,
-    members: int,
-    route: NDArray[np.int32],
+    distances: Steps, routes: Steps, closed: bool, limit: int, members: int, route: Steps
 ) -> int:
     """Write the landmarks of a set's shortest closed tour within a limit; return how many.
 

@@ -20,13 +20,7 @@ import numpy as np
 from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.solution import (
-    UNBOUNDED,
-    Routes,
-    Solution,
-    landmark_distances,
-    solution_of,
-)
+from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 
 __all__ = ["DEFAULT_SECONDS", "import_pyvrp", "solve_pyvrp"]
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.problem import next_word, scramble
 from mapp_env.solvers.solution import UNBOUNDED
 
 __all__ = ["Layout", "Scratch", "Team", "improve"]
@@ -32,8 +33,6 @@ MEAN_REMOVED = 10
 MAX_STRING = 10
 LONGEST_PERCENT = 75
 MEAN_BLINK = 100  # places tried between two that are skipped
-
-LOW_32_BITS = 0xFFFFFFFF
 
 # Places in `Search.memory`.
 WORD, COST, BEST, BEST_TOTAL, DONE, IMPROVED, CYCLE_END, CYCLE = range(8)
@@ -123,15 +122,10 @@ def improve(
 
 @kernel
 def draw(memory: NDArray[np.int64], span: int) -> int:
-    """Return a random integer in 0..span-1, for a span of at most 2**30.
-
-    A 32-bit PCG RXS-M-XS (O'Neill 2014, HMC-CS-2014-0905) in 64-bit signed arithmetic that never
-    overflows, so that it means the same with and without compilation.
-    """
-    state = (memory[WORD] * 747796405 + 2891336453) & LOW_32_BITS
-    memory[WORD] = state
-    state = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & LOW_32_BITS
-    return int((((state >> 22) ^ state) * span) >> 32)
+    """Return a random integer in 0..span-1, for a span of at most 2**30."""
+    word = memory[WORD]
+    memory[WORD] = next_word(word)
+    return int((scramble(word) * span) >> 32)
 
 
 @kernel

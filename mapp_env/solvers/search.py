@@ -28,13 +28,7 @@ from mapp_env.solvers.ruin_recreate import (
     Team,
     improve,
 )
-from mapp_env.solvers.solution import (
-    UNBOUNDED,
-    Routes,
-    Solution,
-    landmark_distances,
-    solution_of,
-)
+from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 from mapp_env.validation import check_count
 
 __all__ = ["DEFAULT_ITERATIONS", "Search", "solve_search"]

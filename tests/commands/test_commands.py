@@ -24,6 +24,8 @@ from PIL import Image
 import mapp_env
 from mapp_env import compiled
 from mapp_env.commands import info, main, solve, universe
+from mapp_env.plans import replay
+from mapp_env.solvers import exact
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LANDMARKS = (0, 6, 20, 42, 48)
@@ -78,6 +80,31 @@ def test_solve_writes_what_it_prints(folder: Path, capsys: pytest.CaptureFixture
     assert plan == mapp_env.solve(PROBLEM)
     with Image.open("a.gif") as image:
         assert image.n_frames == plan.cover_time + 1
+
+
+@pytest.mark.parametrize("picture", ["a.gif", "a.png"])
+def test_each_thing_is_done_once(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, picture: str
+) -> None:
+    """However a plan is printed, written and drawn, it is found once and played once."""
+    done: Counter[str] = Counter()
+
+    def counted(module: types.ModuleType, name: str) -> None:
+        real = getattr(module, name)
+
+        def count(*arguments: object) -> object:
+            done[name] += 1
+            return real(*arguments)
+
+        monkeypatch.setattr(module, name, count)
+
+    mapp_env.replay(PROBLEM, [[0, 0, 0]])  # the last episode, which is kept, is another one
+    counted(exact, "route_tables")
+    counted(replay, "play_row")
+    options = ["--landmarks", *CELLS, "--out", "plan.json", "--picture", picture]
+    assert record(capsys, "solve", *options)["cover_time"] == 12
+    assert done == {"route_tables": 1, "play_row": 1}
+    assert mapp_env.Plan.load("plan.json").cost == 12
 
 
 def test_a_problem_file_is_a_problem(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,6 +23,20 @@ DIGESTS = {
 """SHA-256 (first 16 digits) of the text of 20 x 27 grids with seeds 0 to 4."""
 
 
+def test_manhattan_distances_are_those_of_rows_and_columns() -> None:
+    """They heed no wall, are at most the steps of a path, and cells off the grid are refused."""
+    grid = make_grid("rooms", rows=9, cols=14)
+    cells = [0, 9 * 14 - 1, grid.depot]
+    found = grid.manhattan_from(cells)
+    for line, cell in zip(found.tolist(), cells, strict=True):
+        row, col = divmod(cell, 14)
+        assert line == [abs(row - r) + abs(col - c) for r in range(9) for c in range(14)]
+    steps = grid.distances_from(cells)
+    assert (found <= np.where(steps < 0, 1000, steps)).all()
+    with pytest.raises(ValueError, match=r"cells must be a cell in 0\.\.125"):
+        grid.manhattan_from([126])
+
+
 def assert_connected(grid: Grid) -> None:
     """Check that every free cell is reached from the depot by a search of this test's own."""
     seen = np.zeros(grid.walls.shape, np.bool_)

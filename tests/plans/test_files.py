@@ -23,6 +23,7 @@ from mapp_env import FileError, Grid, Plan, Problem, make_grid, replay, solve
 from mapp_env.commands import main
 from mapp_env.files import (
     check_writable,
+    parse_json,
     read_bytes,
     remove_unfinished,
     write_bytes,
@@ -296,6 +297,34 @@ def test_json_has_no_such_numbers(value: str, tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_text(f'{{"x": [{value}]}}')
     with pytest.raises(FileError, match="is not strict JSON"):
         Plan.load(tmp_path / "bad.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        '{"a": 1, "a": 1}',
+        "[NaN]",
+        "[-Infinity]",
+        "1e999",
+        "[" * 100_000,
+        "\ufeff{}",
+        "{} 1",
+    ],
+)
+def test_strict_json_is_refused_as_the_caller_says(text: str) -> None:
+    """Whatever is wrong is an error of the type asked for that names the place."""
+
+    class OwnError(ValueError):
+        pass
+
+    for data in (text, text.encode()):
+        with pytest.raises(OwnError, match=r"^some place: "):
+            parse_json(data, "some place", OwnError)
+    with pytest.raises(OwnError, match=r"^some place: is not strict JSON"):
+        parse_json(b'"\xff"', "some place", OwnError)
+    assert parse_json('{"a": [1, 2.5, null]}', "some place") == {"a": [1, 2.5, None]}
 
 
 HOSTILE: dict[str, bytes] = {

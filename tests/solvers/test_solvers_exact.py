@@ -504,7 +504,7 @@ def test_universe_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """However many problems are solved at a time, the results are the same."""
     grid = mapp_env.make_grid()
     landmarks, optimum = solve_universe(grid, 3, 2, "makespan")
-    monkeypatch.setattr("mapp_env.solvers.universe.CHUNK_WORK", 27 * 7)
+    monkeypatch.setattr("mapp_env.solvers.batch.CHUNK_WORK", 27 * 7)
     again = solve_universe(grid, 3, 2, "makespan")
     np.testing.assert_array_equal(again[0], landmarks)
     np.testing.assert_array_equal(again[1], optimum)

@@ -246,7 +246,7 @@ def test_an_empty_route_hides_no_other() -> None:
     """A landmark goes where it costs least, also if an agent before that one has no route."""
     grid = Grid(np.zeros((1, 6), np.bool_), 0)
     search = Search(landmark_distances(Problem(grid, (4, 5), 2)), 2, "makespan", 1)
-    layout, team = search._layout._replace(weight=0), search._trial
+    layout, team = search._layout._replace(weight=0), search._teams[1]
     team.routes[1, 0], team.sizes[1], team.lengths[1] = 1, 1, 8
     search._scratch.removed[0] = 2
     recreate(1, layout, team, search._scratch, search._memory)
