@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from mapp_env.engine.observation import Observation, View, view, view_distances
 from mapp_env.engine.rules import Reward, reward_distances
 from mapp_env.engine.state import N_ACTIONS, NO_DISTANCES, World, cell_table
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
+from mapp_env.grids import find_grid
 from mapp_env.problem import (
     MAX_AGENTS,
     MAX_CYCLES,
@@ -21,12 +23,28 @@ from mapp_env.problem import (
 )
 from mapp_env.validation import check_choice, check_count, check_flag
 
-__all__ = ["RENDER_MODES", "Task", "make_world"]
+__all__ = ["RENDER_MODES", "GridLike", "Task", "make_world"]
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
 
 MAX_BYTES = 1 << 30
 """Largest array of one kind (observations, distance fields) that an environment may need."""
+
+
+class GridLike:
+    """A field that is given a grid, its name or its path, and holds the grid."""
+
+    @overload
+    def __get__(self, task: None, owner: type) -> str: ...
+
+    @overload
+    def __get__(self, task: Task, owner: type) -> Grid: ...
+
+    def __get__(self, task: Task | None, owner: type) -> str | Grid:
+        return "paper-7x7" if task is None else task.__dict__["grid"]
+
+    def __set__(self, task: Task, grid: str | os.PathLike[str] | Grid) -> None:
+        task.__dict__["grid"] = find_grid(grid)
 
 
 @dataclass(frozen=True)
@@ -35,8 +53,8 @@ class Task:
 
     Parameters
     ----------
-    grid : Grid
-        The grid; :func:`mapp_env.grids.find_grid` finds one by name or path.
+    grid : str, os.PathLike or Grid
+        A bundled name, a path to a text or MovingAI ``.map`` file, or a grid.
     n_agents : int
         1 to 16.
     n_landmarks : int
@@ -58,7 +76,7 @@ class Task:
         If an argument is invalid, or what they ask for together would not fit in memory.
     """
 
-    grid: Grid
+    grid: GridLike = GridLike()
     n_agents: int = 3
     n_landmarks: int = 5
     max_cycles: int = 50

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from mapp_env.engine.loops import fill_joint_mask, fill_joint_masks
 from mapp_env.engine.observation import Observation
 from mapp_env.engine.task import Task
-from mapp_env.envs.gymnasium_env import SimulationEnv
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
+from mapp_env.envs.arguments import takes
+from mapp_env.envs.face import SimulationEnv
 from mapp_env.validation import as_integer, check_choice, describe
 
 __all__ = [
@@ -92,6 +91,13 @@ def central_action_masks(
     return joint.view(np.bool_)
 
 
+@dataclass(frozen=True)
+class CentralTask(Task):
+    """The same, and how the meta-agent's actions are given."""
+
+    central_action: str = "auto"
+
+
 class CentralEnv(SimulationEnv):
     """The problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
 
@@ -118,33 +124,13 @@ class CentralEnv(SimulationEnv):
         If an argument is invalid.
     """
 
-    def __init__(
-        self,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "global",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-        central_action: str = "auto",
-    ) -> None:
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
-        )
+    @takes(CentralTask)
+    def __init__(self, task: CentralTask) -> None:
         self._once = task.observation_kind == Observation.GLOBAL
         super().__init__(task, 1 if self._once else task.n_agents)
         view = task.central_view
         self.observation_space = Box(view.low, view.high, dtype=np.float32)
-        self.action_space, self._joint_actions = central_action_space(task, central_action)
+        self.action_space, self._joint_actions = central_action_space(task, task.central_action)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

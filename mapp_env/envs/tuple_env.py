@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,20 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mapp_env.engine.task import Task
-from mapp_env.envs.gymnasium_env import SimulationEnv
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
+from mapp_env.envs.arguments import takes
+from mapp_env.envs.face import SimulationEnv
 from mapp_env.validation import as_integer, describe
 
 __all__ = ["TupleEnv"]
 
 Views = tuple[NDArray[np.float32], ...]
+
+
+@dataclass(frozen=True)
+class TupleTask(Task):
+    """The same, but that agents see themselves first unless something else is asked for."""
+
+    observation: str = "own_first"
 
 
 class TupleEnv(SimulationEnv):
@@ -47,27 +53,8 @@ class TupleEnv(SimulationEnv):
         If an argument is invalid.
     """
 
-    def __init__(
-        self,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "own_first",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-    ) -> None:
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
-        )
+    @takes(TupleTask)
+    def __init__(self, task: TupleTask) -> None:
         super().__init__(task, task.n_agents)
         self.n_agents = task.n_agents
         seen = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
@@ -128,10 +115,6 @@ class TupleEnv(SimulationEnv):
                 f"got {describe(action)}"
             )
         return np.array(numbers, np.int64)
-
-    def state(self) -> NDArray[np.float32]:
-        """Return the global observation (R9), shape (N + 2K,) float32, whatever agents see."""
-        return self._simulation.state()
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success, cover_time, makespan and total_distance of the episode so far.

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,9 @@ from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
 from mapp_env.engine.sources import check_problems, check_reset_mask, draw_problems
 from mapp_env.engine.task import Task
-from mapp_env.envs.central_env import CentralEnv, central_action_space
+from mapp_env.envs.arguments import takes
+from mapp_env.envs.central_env import CentralEnv, CentralTask, central_action_space
 from mapp_env.envs.vector_infos import Transition, add_joint_masks, make_infos
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
 from mapp_env.validation import check_choice, check_count
@@ -46,6 +45,14 @@ __all__ = ["MAX_ENVS", "MappVectorEnv", "make_vec"]
 MAX_ENVS = 1 << 20
 
 VECTOR_RENDER_MODES = ("rgb_array", "ansi")
+
+
+@dataclass(frozen=True)
+class BatchTask(CentralTask):
+    """The same, and what happens at the end of an episode."""
+
+    central_action: str = "multi"
+    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
 
 
 class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
@@ -77,37 +84,17 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         If an argument is invalid.
     """
 
-    def __init__(
-        self,
-        num_envs: int,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "global",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-        central_action: str = "multi",
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    ) -> None:
+    @takes(BatchTask)
+    def __init__(self, num_envs: int, task: BatchTask) -> None:
         self.num_envs = check_count("num_envs", num_envs, 1, MAX_ENVS)
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
+        self.single_action_space, self.joint_actions = central_action_space(
+            task, task.central_action
         )
-        self.single_action_space, self.joint_actions = central_action_space(task, central_action)
         self._n_joint_actions = 0 if self.joint_actions is None else len(self.joint_actions)
         task.check_memory(self.num_envs, self._n_joint_actions)
-        self.task = task
+        self.task: Task = task
         check_choice("render_mode", task.render_mode, (None, *VECTOR_RENDER_MODES))
-        self.autoreset_mode = _find_mode(autoreset_mode)
+        self.autoreset_mode = _find_mode(task.autoreset_mode)
         self.metadata = {
             **CentralEnv.metadata,
             "render_modes": list(VECTOR_RENDER_MODES),
