@@ -49,26 +49,9 @@ class GridLike:
 
 @dataclass(frozen=True)
 class Task:
-    """What an environment is made of; all faces take these arguments and mean the same by them.
+    """What an environment is made of: the arguments that all faces take, validated.
 
-    Parameters
-    ----------
-    grid : str, os.PathLike or Grid
-        A bundled name, a path to a text or MovingAI ``.map`` file, or a grid.
-    n_agents : int
-        1 to 16.
-    n_landmarks : int
-        1 to 256, and no more than cells that can be reached.
-    max_cycles : int
-        Step at which an episode is truncated (R7), 1 to 1,000,000.
-    reward : {"manhattan", "geodesic", "step"}
-        The team reward (R6).
-    observation : {"global", "own_first", "planes", "geodesic"}
-        The observation kind (see :mod:`mapp_env.engine.observation`).
-    allow_wait : bool
-        Whether there is a fifth action, to wait (R3).
-    render_mode : {None, "human", "rgb_array", "ansi"}
-        How ``render()`` shows an episode.
+    Their meaning is said once, in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
     Raises
     ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,37 +11,31 @@ from numpy.typing import NDArray
 
 from mapp_env.engine.loops import fill_joint_mask, fill_joint_masks
 from mapp_env.engine.observation import Observation
-from mapp_env.engine.task import Task
-from mapp_env.envs.arguments import takes
+from mapp_env.envs.arguments import CentralTask, takes
 from mapp_env.envs.face import SimulationEnv
-from mapp_env.validation import as_integer, check_choice, describe
+from mapp_env.validation import as_integer, describe
 
 __all__ = [
-    "CENTRAL_ACTIONS",
     "MAX_JOINT_AGENTS",
     "CentralEnv",
     "central_action_masks",
     "central_action_space",
 ]
 
-CENTRAL_ACTIONS = ("auto", "joint", "multi")
-
 MAX_JOINT_AGENTS = 6
 """Largest team whose joint actions are numbered one by one (4**6 = 4096)."""
 
 
 def central_action_space(
-    task: Task, central_action: str
+    task: CentralTask,
 ) -> tuple[Discrete[np.int64] | MultiDiscrete, NDArray[np.int64] | None]:
     """Return the meta-agent's action space and, for numbered joint actions, their table.
 
     Parameters
     ----------
-    task : Task
-        What is simulated.
-    central_action : {"auto", "joint", "multi"}
-        ``"joint"`` numbers the joint actions, the first agent most significant; ``"multi"`` takes
-        one action an agent; ``"auto"`` is joint up to six agents.
+    task : CentralTask
+        ``central_action="joint"`` numbers the joint actions, the first agent most significant;
+        ``"multi"`` takes one action an agent; ``"auto"`` is joint up to six agents.
 
     Returns
     -------
@@ -54,8 +47,7 @@ def central_action_space(
     ValueError
         If joint actions are asked for more than six agents.
     """
-    check_choice("central_action", central_action, CENTRAL_ACTIONS)
-    n_agents, n_actions = task.n_agents, task.n_actions
+    n_agents, n_actions, central_action = task.n_agents, task.n_actions, task.central_action
     if central_action == "joint" and n_agents > MAX_JOINT_AGENTS:
         raise ValueError(
             f"central_action='joint' is for at most {MAX_JOINT_AGENTS} agents, got n_agents="
@@ -91,13 +83,6 @@ def central_action_masks(
     return joint.view(np.bool_)
 
 
-@dataclass(frozen=True)
-class CentralTask(Task):
-    """The same, and how the meta-agent's actions are given."""
-
-    central_action: str = "auto"
-
-
 class CentralEnv(SimulationEnv):
     """The problem for one meta-agent (paper, section 5), registered as ``mapp_env/Central-v0``.
 
@@ -130,7 +115,7 @@ class CentralEnv(SimulationEnv):
         super().__init__(task, 1 if self._once else task.n_agents)
         view = task.central_view
         self.observation_space = Box(view.low, view.high, dtype=np.float32)
-        self.action_space, self._joint_actions = central_action_space(task, task.central_action)
+        self.action_space, self._joint_actions = central_action_space(task)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mapp_env.engine.task import Task
-from mapp_env.envs.arguments import takes
+from mapp_env.envs.arguments import TupleTask, takes
 from mapp_env.envs.face import SimulationEnv
 from mapp_env.validation import as_integer, describe
 
 __all__ = ["TupleEnv"]
 
 Views = tuple[NDArray[np.float32], ...]
-
-
-@dataclass(frozen=True)
-class TupleTask(Task):
-    """The same, but that agents see themselves first unless something else is asked for."""
-
-    observation: str = "own_first"
 
 
 class TupleEnv(SimulationEnv):
