@@ -128,7 +128,7 @@ class CentralEnv(SimulationEnv):
             If seed or options cannot be used.
         """
         views, masks = self._start(seed, options)
-        return self._seen(views), self._find_info(masks)
+        return self._observation(views), self._find_info(masks)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out a joint action.
@@ -144,7 +144,7 @@ class CentralEnv(SimulationEnv):
         info = self._find_info(masks)
         if terminated or truncated:
             info["metrics"] = self._simulation.metrics()
-        return self._seen(views), reward, terminated, truncated, info
+        return self._observation(views), reward, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
@@ -183,17 +183,8 @@ class CentralEnv(SimulationEnv):
                 )
             joint: NDArray[np.int64] = self._joint_actions[number]
             return joint
-        task = self.task
-        numbers = [as_integer(one) for one in action] if np.ndim(action) == 1 else []
-        if len(numbers) != task.n_agents or not all(
-            number is not None and 0 <= number < task.n_actions for number in numbers
-        ):
-            raise ValueError(
-                f"action must hold {task.n_agents} integers in 0..{task.n_actions - 1}, one an "
-                f"agent, got {describe(action)}"
-            )
-        return np.array(numbers, np.int64)
+        return super()._read_action(action)
 
-    def _seen(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what the meta-agent sees of the agents' views, shape (V, ...)."""
+    def _observation(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the meta-agent's observation of the agents' views, shape (V, ...)."""
         return views[0] if self._once else views

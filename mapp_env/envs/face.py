@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -18,7 +17,7 @@ from mapp_env.engine.sources import check_options
 from mapp_env.engine.task import RENDER_MODES, Task
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
-from mapp_env.validation import MAX_SEED, check_count
+from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
 
 __all__ = ["Face", "SimulationEnv"]
 
@@ -109,7 +108,7 @@ class Face:
 
 
 class SimulationEnv(Face, gymnasium.Env[Any, Any]):
-    """The same for Gymnasium; its subclasses say what is seen and how one acts."""
+    """The same for Gymnasium; its subclasses say what is observed."""
 
     def _play(self, action: Any) -> tuple[float, bool, bool, NDArray[np.float32], NDArray[np.int8]]:
         """Carry out an action; return what :meth:`Simulation.step` does."""
@@ -120,6 +119,16 @@ class SimulationEnv(Face, gymnasium.Env[Any, Any]):
             self.render()
         return found
 
-    @abstractmethod
     def _read_action(self, action: Any) -> NDArray[np.int64]:
-        """Return each agent's action, shape (N,), or raise a ValueError."""
+        """Return each agent's action, shape (N,), of one action an agent, or raise a ValueError."""
+        n_agents, highest = self.task.n_agents, self.task.n_actions - 1
+        several = isinstance(action, Sequence) or np.ndim(action) == 1
+        numbers = [as_integer(one) for one in action] if several else []
+        if len(numbers) != n_agents or not all(
+            number is not None and 0 <= number <= highest for number in numbers
+        ):
+            raise ValueError(
+                f"action must hold {n_agents} integers in 0..{highest}, one an agent, "
+                f"got {describe(action)}"
+            )
+        return np.array(numbers, np.int64)

@@ -78,8 +78,6 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
         self._n_actions = task.n_actions
         self._actions = np.zeros(task.n_agents, np.int64)
 
-    # -- what agents have --------------------------------------------------------------
-
     def observation_space(self, agent: AgentID) -> Box:
         """Return the space of an agent's observations; the same object each time."""
         return self.observation_spaces[agent]
@@ -87,8 +85,6 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
     def action_space(self, agent: AgentID) -> Discrete[np.int64]:
         """Return the space of an agent's actions; the same object each time."""
         return self.action_spaces[agent]
-
-    # -- episodes ----------------------------------------------------------------------
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mapp_env.envs.arguments import TupleTask, takes
 from mapp_env.envs.face import SimulationEnv
-from mapp_env.validation import as_integer, describe
 
 __all__ = ["TupleEnv"]
 
@@ -48,8 +47,8 @@ class TupleEnv(SimulationEnv):
     def __init__(self, task: TupleTask) -> None:
         super().__init__(task, task.n_agents)
         self.n_agents = task.n_agents
-        seen = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
-        self.observation_space = spaces.Tuple([seen] * task.n_agents)
+        space = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
+        self.observation_space = spaces.Tuple([space] * task.n_agents)
         self.action_space = spaces.Tuple(
             [spaces.Discrete(task.n_actions) for _ in range(task.n_agents)]
         )
@@ -91,21 +90,6 @@ class TupleEnv(SimulationEnv):
         reward, terminated, truncated, views, self.action_masks = self._play(action)
         info = {"success": float(terminated)} if terminated or truncated else {}
         return tuple(views), [reward] * self.n_agents, terminated, truncated, info
-
-    def _read_action(self, action: Any) -> NDArray[np.int64]:
-        """Return each agent's action, shape (N,)."""
-        highest = self.task.n_actions - 1
-        numbers = [as_integer(one) for one in action] if isinstance(action, Sequence) else []
-        if isinstance(action, np.ndarray) and action.ndim == 1:
-            numbers = [as_integer(one) for one in action]
-        if len(numbers) != self.n_agents or not all(
-            number is not None and 0 <= number <= highest for number in numbers
-        ):
-            raise ValueError(
-                f"action must hold {self.n_agents} integers in 0..{highest}, one an agent, "
-                f"got {describe(action)}"
-            )
-        return np.array(numbers, np.int64)
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success, cover_time, makespan and total_distance of the episode so far.

@@ -101,8 +101,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     def max_cycles(self, value: int) -> None:
         self._rows.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
 
-    # -- seeds -------------------------------------------------------------------------
-
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The seed of each row; a single environment reset with it is that row."""
@@ -114,8 +112,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """The generator of each row; up to 64 words of it may have been fetched ahead."""
         self._seeds.seed(None, [])
         return tuple(self._seeds.generators)
-
-    # -- episodes ----------------------------------------------------------------------
 
     def reset(
         self,
@@ -252,8 +248,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """Start an episode on a random problem in some rows."""
         self._rows.start(indices, draw_problems(self.task, self._seeds.next_words(indices)))
 
-    # -- checks ------------------------------------------------------------------------
-
     def _read_actions(self, actions: Any) -> NDArray[np.int64]:
         """Return each agent's action in each row, shape (B, N)."""
         joint = self.joint_actions is not None
@@ -280,8 +274,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"got {np.asarray(actions).flat[bad]}"
             )
         return array if self.joint_actions is None else self.joint_actions[array]
-
-    # -- pictures ----------------------------------------------------------------------
 
     def render(self) -> tuple[Any, ...] | None:
         """Return a picture of each row: arrays for "rgb_array", strings for "ansi".
