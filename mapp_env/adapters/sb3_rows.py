@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -35,6 +37,9 @@ class RowsVecEnv(VecEnv):
     def __init__(self, batch: Any, name: str, observation_space: Any, action_space: Any) -> None:
         self._batch, self._name = batch, name
         self._actions: Any = None
+        self._seed: int | None = None  # of the next reset, and its options
+        self._wishes: dict[str, Any] | None = None
+        self._masks: NDArray[Any] | None = None  # (B, ...), once there are episodes
         super().__init__(batch.num_envs, observation_space, action_space)
         # For recorders of films, which take 30 a second where nothing is said.
         self.metadata = {**self.metadata, "render_fps": batch.metadata["render_fps"]}
@@ -43,9 +48,27 @@ class RowsVecEnv(VecEnv):
         """Keep the rows' actions, shape (B, ...), for :meth:`step_wait`."""
         self._actions = actions
 
-    @abstractmethod
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions do not bump in each row, shape (B, ...)."""
+        """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
+
+        Returns
+        -------
+        ndarray of bool, shape (B, ...)
+            Of one agent's actions (B, A), of numbered joint actions (B, A**N), or of each agent's
+            actions, one agent after the other, (B, N * A).
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before the first reset.
+        """
+        if self._masks is None:
+            raise ResetNeeded("action_masks() needs episodes: call reset() first")
+        return self._find_masks(self._masks)
+
+    @abstractmethod
+    def _find_masks(self, masks: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return fresh action masks, shape (B, ...), of what is kept in ``_masks``."""
 
     def _mask_of(self, row: int) -> NDArray[np.bool_]:
         mask: NDArray[np.bool_] = self.action_masks()[row]
@@ -53,12 +76,19 @@ class RowsVecEnv(VecEnv):
 
     @property
     @abstractmethod
+    def _limited(self) -> Sequence[Any]:
+        """What has a step limit."""
+
+    @property
     def max_cycles(self) -> int:
         """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
+        limit: int = self._limited[0].max_cycles
+        return limit
 
     @max_cycles.setter
-    @abstractmethod
-    def max_cycles(self, value: int) -> None: ...
+    def max_cycles(self, value: int) -> None:
+        for one in self._limited:
+            one.max_cycles = value
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return the batch's attribute, or the spaces of a row, once for each row asked for."""

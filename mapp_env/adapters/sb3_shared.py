@@ -9,7 +9,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import supersuit
-from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
@@ -50,24 +49,10 @@ class SharedVecEnv(RowsVecEnv):
             )
         self.venv = venv
         self.n_agents = n_agents
-        self._seed: int | None = None
-        self._wishes: dict[str, Any] | None = None
-        self._masks: NDArray[np.bool_] | None = None  # (B, A), once there are episodes
         super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
     @property
-    def max_cycles(self) -> int:
-        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
-        limit: int = self._teams[0].max_cycles
-        return limit
-
-    @max_cycles.setter
-    def max_cycles(self, value: int) -> None:
-        for team in self._teams:
-            team.max_cycles = value
-
-    @property
-    def _teams(self) -> list[MappParallelEnv]:
+    def _limited(self) -> list[MappParallelEnv]:
         """The environments, one a team."""
         return [one.par_env.unwrapped for one in self.venv.vec_envs]  # type: ignore[attr-defined]
 
@@ -151,21 +136,8 @@ class SharedVecEnv(RowsVecEnv):
         self._keep_masks(infos)
         return np.array(observations), np.array(rewards), dones, infos
 
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions do not bump, as sb3-contrib's ``MaskablePPO`` asks for it.
-
-        Returns
-        -------
-        ndarray of bool, shape (B, A)
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
-        """
-        if self._masks is None:
-            raise ResetNeeded("action_masks() needs episodes: call reset() first")
-        return self._masks.copy()
+    def _find_masks(self, masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return masks.copy()
 
     def _keep_masks(self, infos: Sequence[dict[str, Any]]) -> None:
         """Keep a copy of the masks: infos are the caller's."""

@@ -8,7 +8,6 @@ from copy import deepcopy
 from typing import Any
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
@@ -73,9 +72,6 @@ class MappSb3VecEnv(RowsVecEnv):
                 f"got {describe(arguments['render_mode'])}"
             )
         self.engine = MappVectorEnv(num_envs, autoreset_mode="SameStep", **arguments)
-        self._seed: int | None = None
-        self._wishes: dict[str, Any] = {}
-        self._masks: NDArray[np.int8] | None = None  # (B, N, A), once there are episodes
         self._returns = np.zeros(self.engine.num_envs)
         self._lengths = np.zeros(self.engine.num_envs, np.int64)
         self._started = time.perf_counter()
@@ -87,13 +83,8 @@ class MappSb3VecEnv(RowsVecEnv):
         )
 
     @property
-    def max_cycles(self) -> int:
-        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
-        return self.engine.max_cycles
-
-    @max_cycles.setter
-    def max_cycles(self, value: int) -> None:
-        self.engine.max_cycles = value
+    def _limited(self) -> list[MappVectorEnv]:
+        return [self.engine]
 
     # -- episodes ----------------------------------------------------------------------
 
@@ -132,7 +123,7 @@ class MappSb3VecEnv(RowsVecEnv):
         if options is None or isinstance(options, Mapping):
             if options is not None and "reset_mask" in options:
                 raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
-            self._wishes = deepcopy(dict(options or {}))
+            self._wishes = None if options is None else deepcopy(dict(options))
             return
         cells = np.array(self._landmarks_by_row(options))
         # As pairs: two rows of two cells could as well be two pairs.
@@ -170,7 +161,7 @@ class MappSb3VecEnv(RowsVecEnv):
         """
         observations, infos = self.engine.reset(seed=self._seed, options=self._wishes)
         self._masks = infos["action_mask"]
-        self._seed, self._wishes = None, {}
+        self._seed, self._wishes = None, None
         self._returns[:] = 0.0
         self._lengths[:] = 0
         return observations
@@ -237,21 +228,8 @@ class MappSb3VecEnv(RowsVecEnv):
             )
         ]
 
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
-
-        Returns
-        -------
-        ndarray of bool, shape (B, N * A) or, with ``central_action="joint"``, (B, A**N)
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
-        """
-        if self._masks is None:
-            raise ResetNeeded("action_masks() needs episodes: call reset() first")
-        return central_action_masks(self._masks, self.engine.joint_actions)
+    def _find_masks(self, masks: NDArray[np.int8]) -> NDArray[np.bool_]:
+        return central_action_masks(masks, self.engine.joint_actions)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return that rows have what ``Monitor`` gives: evaluations read ``episode`` then."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from mapp_env.engine.observation import Observation, View, view, view_distances
 from mapp_env.engine.rules import Reward, reward_distances
 from mapp_env.engine.state import N_ACTIONS, NO_DISTANCES, World, cell_table
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
+from mapp_env.grids import find_grid
 from mapp_env.problem import (
     MAX_AGENTS,
     MAX_CYCLES,
@@ -21,7 +23,7 @@ from mapp_env.problem import (
 )
 from mapp_env.validation import check_choice, check_count, check_flag
 
-__all__ = ["RENDER_MODES", "Task", "make_world"]
+__all__ = ["RENDER_MODES", "GridLike", "Task", "make_world"]
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
 
@@ -29,28 +31,27 @@ MAX_BYTES = 1 << 30
 """Largest array of one kind (observations, distance fields) that an environment may need."""
 
 
+class GridLike:
+    """A field that is given a grid, its name or its path, and holds the grid."""
+
+    @overload
+    def __get__(self, task: None, owner: type) -> str: ...
+
+    @overload
+    def __get__(self, task: Task, owner: type) -> Grid: ...
+
+    def __get__(self, task: Task | None, owner: type) -> str | Grid:
+        return "paper-7x7" if task is None else task.__dict__["grid"]
+
+    def __set__(self, task: Task, grid: str | os.PathLike[str] | Grid) -> None:
+        task.__dict__["grid"] = find_grid(grid)
+
+
 @dataclass(frozen=True)
 class Task:
-    """What an environment is made of; all faces take these arguments and mean the same by them.
+    """What an environment is made of: the arguments that all faces take, validated.
 
-    Parameters
-    ----------
-    grid : Grid
-        The grid; :func:`mapp_env.grids.find_grid` finds one by name or path.
-    n_agents : int
-        1 to 16.
-    n_landmarks : int
-        1 to 256, and no more than cells that can be reached.
-    max_cycles : int
-        Step at which an episode is truncated (R7), 1 to 1,000,000.
-    reward : {"manhattan", "geodesic", "step"}
-        The team reward (R6).
-    observation : {"global", "own_first", "planes", "geodesic"}
-        The observation kind (see :mod:`mapp_env.engine.observation`).
-    allow_wait : bool
-        Whether there is a fifth action, to wait (R3).
-    render_mode : {None, "human", "rgb_array", "ansi"}
-        How ``render()`` shows an episode.
+    Their meaning is said once, in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
     Raises
     ------
@@ -58,7 +59,7 @@ class Task:
         If an argument is invalid, or what they ask for together would not fit in memory.
     """
 
-    grid: Grid
+    grid: GridLike = GridLike()
     n_agents: int = 3
     n_landmarks: int = 5
     max_cycles: int = 50

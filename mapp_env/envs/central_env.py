@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
@@ -12,38 +11,31 @@ from numpy.typing import NDArray
 
 from mapp_env.engine.loops import fill_joint_mask, fill_joint_masks
 from mapp_env.engine.observation import Observation
-from mapp_env.engine.task import Task
-from mapp_env.envs.gymnasium_env import SimulationEnv
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
-from mapp_env.validation import as_integer, check_choice, describe
+from mapp_env.envs.arguments import CentralTask, takes
+from mapp_env.envs.face import SimulationEnv
+from mapp_env.validation import as_integer, describe
 
 __all__ = [
-    "CENTRAL_ACTIONS",
     "MAX_JOINT_AGENTS",
     "CentralEnv",
     "central_action_masks",
     "central_action_space",
 ]
 
-CENTRAL_ACTIONS = ("auto", "joint", "multi")
-
 MAX_JOINT_AGENTS = 6
 """Largest team whose joint actions are numbered one by one (4**6 = 4096)."""
 
 
 def central_action_space(
-    task: Task, central_action: str
+    task: CentralTask,
 ) -> tuple[Discrete[np.int64] | MultiDiscrete, NDArray[np.int64] | None]:
     """Return the meta-agent's action space and, for numbered joint actions, their table.
 
     Parameters
     ----------
-    task : Task
-        What is simulated.
-    central_action : {"auto", "joint", "multi"}
-        ``"joint"`` numbers the joint actions, the first agent most significant; ``"multi"`` takes
-        one action an agent; ``"auto"`` is joint up to six agents.
+    task : CentralTask
+        ``central_action="joint"`` numbers the joint actions, the first agent most significant;
+        ``"multi"`` takes one action an agent; ``"auto"`` is joint up to six agents.
 
     Returns
     -------
@@ -55,8 +47,7 @@ def central_action_space(
     ValueError
         If joint actions are asked for more than six agents.
     """
-    check_choice("central_action", central_action, CENTRAL_ACTIONS)
-    n_agents, n_actions = task.n_agents, task.n_actions
+    n_agents, n_actions, central_action = task.n_agents, task.n_actions, task.central_action
     if central_action == "joint" and n_agents > MAX_JOINT_AGENTS:
         raise ValueError(
             f"central_action='joint' is for at most {MAX_JOINT_AGENTS} agents, got n_agents="
@@ -118,33 +109,13 @@ class CentralEnv(SimulationEnv):
         If an argument is invalid.
     """
 
-    def __init__(
-        self,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "global",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-        central_action: str = "auto",
-    ) -> None:
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
-        )
+    @takes(CentralTask)
+    def __init__(self, task: CentralTask) -> None:
         self._once = task.observation_kind == Observation.GLOBAL
         super().__init__(task, 1 if self._once else task.n_agents)
         view = task.central_view
         self.observation_space = Box(view.low, view.high, dtype=np.float32)
-        self.action_space, self._joint_actions = central_action_space(task, central_action)
+        self.action_space, self._joint_actions = central_action_space(task)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -157,7 +128,7 @@ class CentralEnv(SimulationEnv):
             If seed or options cannot be used.
         """
         views, masks = self._start(seed, options)
-        return self._seen(views), self._find_info(masks)
+        return self._observation(views), self._find_info(masks)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out a joint action.
@@ -173,7 +144,7 @@ class CentralEnv(SimulationEnv):
         info = self._find_info(masks)
         if terminated or truncated:
             info["metrics"] = self._simulation.metrics()
-        return self._seen(views), reward, terminated, truncated, info
+        return self._observation(views), reward, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
@@ -212,17 +183,8 @@ class CentralEnv(SimulationEnv):
                 )
             joint: NDArray[np.int64] = self._joint_actions[number]
             return joint
-        task = self.task
-        numbers = [as_integer(one) for one in action] if np.ndim(action) == 1 else []
-        if len(numbers) != task.n_agents or not all(
-            number is not None and 0 <= number < task.n_actions for number in numbers
-        ):
-            raise ValueError(
-                f"action must hold {task.n_agents} integers in 0..{task.n_actions - 1}, one an "
-                f"agent, got {describe(action)}"
-            )
-        return np.array(numbers, np.int64)
+        return super()._read_action(action)
 
-    def _seen(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return what the meta-agent sees of the agents' views, shape (V, ...)."""
+    def _observation(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the meta-agent's observation of the agents' views, shape (V, ...)."""
         return views[0] if self._once else views

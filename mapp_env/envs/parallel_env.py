@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pettingzoo
-from gymnasium import logger
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
-from mapp_env.engine.simulation import Simulation
-from mapp_env.engine.sources import check_options
-from mapp_env.engine.task import RENDER_MODES, Task
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
-from mapp_env.problem import MAX_CYCLES
-from mapp_env.rendering.display import Display
-from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
+from mapp_env.engine.task import Task
+from mapp_env.envs.arguments import takes
+from mapp_env.envs.face import Face
+from mapp_env.validation import as_integer, describe
 
 __all__ = ["MappParallelEnv"]
 
@@ -29,7 +22,7 @@ AgentID = str
 Infos = dict[AgentID, dict[str, Any]]
 
 
-class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int]):
+class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int]):
     """Multi-agent path planning on a walled grid: visit every landmark together, in few steps.
 
     Agents start on the depot and move at the same instant; a landmark is visited for good when an
@@ -65,34 +58,13 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own attribute; never changed here
         "name": "mapp_v0",
-        "render_modes": list(RENDER_MODES),
-        "render_fps": 5,
+        **Face.metadata,
         "is_parallelizable": True,
     }
 
-    def __init__(
-        self,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "global",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-    ) -> None:
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
-        )
-        self.task = task
-        self.render_mode = task.render_mode
+    @takes(Task)
+    def __init__(self, task: Task) -> None:
+        super().__init__(task, task.n_agents)
         self.possible_agents = [f"agent_{index}" for index in range(task.n_agents)]
         self.agents: list[AgentID] = []
         # One space for all agents: on a large grid its bounds are the largest arrays there are.
@@ -105,12 +77,6 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         self._flags = {flag: dict.fromkeys(self._names, flag) for flag in (False, True)}
         self._n_actions = task.n_actions
         self._actions = np.zeros(task.n_agents, np.int64)
-        self._simulation = Simulation(task, task.n_agents)
-        self._np_random: np.random.Generator | None = None
-        self._started = False
-        self._display = Display(task.render_mode, self.metadata["render_fps"])
-
-    # -- what agents have --------------------------------------------------------------
 
     def observation_space(self, agent: AgentID) -> Box:
         """Return the space of an agent's observations; the same object each time."""
@@ -119,28 +85,6 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
     def action_space(self, agent: AgentID) -> Discrete[np.int64]:
         """Return the space of an agent's actions; the same object each time."""
         return self.action_spaces[agent]
-
-    @property
-    def max_cycles(self) -> int:
-        """Step at which an episode is truncated (R7)."""
-        return self._simulation.max_cycles
-
-    @max_cycles.setter
-    def max_cycles(self, value: int) -> None:
-        self._simulation.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
-
-    def state(self) -> NDArray[np.float32]:
-        """Return the global observation (R9), shape (N + 2K,) float32, whatever agents see."""
-        return self._simulation.state()
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        """The generator that problems are drawn from, as Gymnasium environments have it."""
-        if self._np_random is None:
-            self._np_random, _ = seeding.np_random()
-        return self._np_random
-
-    # -- episodes ----------------------------------------------------------------------
 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -167,18 +111,9 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         ValueError
             If seed or options cannot be used.
         """
-        if seed is not None:
-            seed = check_count("seed", seed, 0, MAX_SEED)
-        problem = check_options(self.task, options)
-        if seed is not None:
-            self._np_random, _ = seeding.np_random(seed)
-        self._simulation.reset(problem, self.np_random)
-        self._started = True
+        views, masks = self._start(seed, options)
         self.agents = list(self._names)
-        observations, infos = self._by_agent(*self._simulation.observe())
-        if self.render_mode == "human":
-            self.render()
-        return observations, infos
+        return self._by_agent(views, masks)
 
     def step(
         self, actions: Mapping[AgentID, int]
@@ -283,28 +218,3 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
             f"actions must hold one action for each of {', '.join(self._names)}; "
             f"missing: {describe(missing)}, unknown: {describe(unknown)}"
         )
-
-    # -- pictures ----------------------------------------------------------------------
-
-    def render(self) -> NDArray[np.uint8] | str | None:
-        """Show the episode as ``render_mode`` says.
-
-        Returns
-        -------
-        ndarray of uint8, shape (H, W, 3), or str, or None
-            For "rgb_array", "ansi" and "human".
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
-        """
-        if not self._started:
-            raise ResetNeeded("render() needs an episode: call reset() first")
-        if self.render_mode is None:
-            logger.warn("render() shows nothing: make the environment with a render_mode")
-        return self._display.show(self._simulation.scene())
-
-    def close(self) -> None:
-        """Close the window, if there is one; may be called again."""
-        self._display.close()

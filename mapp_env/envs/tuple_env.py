@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,11 +9,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mapp_env.engine.task import Task
-from mapp_env.envs.gymnasium_env import SimulationEnv
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
-from mapp_env.validation import as_integer, describe
+from mapp_env.envs.arguments import TupleTask, takes
+from mapp_env.envs.face import SimulationEnv
 
 __all__ = ["TupleEnv"]
 
@@ -47,31 +43,12 @@ class TupleEnv(SimulationEnv):
         If an argument is invalid.
     """
 
-    def __init__(
-        self,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "own_first",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-    ) -> None:
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
-        )
+    @takes(TupleTask)
+    def __init__(self, task: TupleTask) -> None:
         super().__init__(task, task.n_agents)
         self.n_agents = task.n_agents
-        seen = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
-        self.observation_space = spaces.Tuple([seen] * task.n_agents)
+        space = spaces.Box(task.view.low, task.view.high, dtype=np.float32)
+        self.observation_space = spaces.Tuple([space] * task.n_agents)
         self.action_space = spaces.Tuple(
             [spaces.Discrete(task.n_actions) for _ in range(task.n_agents)]
         )
@@ -113,25 +90,6 @@ class TupleEnv(SimulationEnv):
         reward, terminated, truncated, views, self.action_masks = self._play(action)
         info = {"success": float(terminated)} if terminated or truncated else {}
         return tuple(views), [reward] * self.n_agents, terminated, truncated, info
-
-    def _read_action(self, action: Any) -> NDArray[np.int64]:
-        """Return each agent's action, shape (N,)."""
-        highest = self.task.n_actions - 1
-        numbers = [as_integer(one) for one in action] if isinstance(action, Sequence) else []
-        if isinstance(action, np.ndarray) and action.ndim == 1:
-            numbers = [as_integer(one) for one in action]
-        if len(numbers) != self.n_agents or not all(
-            number is not None and 0 <= number <= highest for number in numbers
-        ):
-            raise ValueError(
-                f"action must hold {self.n_agents} integers in 0..{highest}, one an agent, "
-                f"got {describe(action)}"
-            )
-        return np.array(numbers, np.int64)
-
-    def state(self) -> NDArray[np.float32]:
-        """Return the global observation (R9), shape (N + 2K,) float32, whatever agents see."""
-        return self._simulation.state()
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success, cover_time, makespan and total_distance of the episode so far.

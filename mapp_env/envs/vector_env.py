@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,32 +19,16 @@ from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
 from mapp_env.engine.sources import check_problems, check_reset_mask, draw_problems
 from mapp_env.engine.task import Task
+from mapp_env.envs.arguments import BATCH_RENDER_MODES, AutoresetMode, BatchTask, takes
 from mapp_env.envs.central_env import CentralEnv, central_action_space
 from mapp_env.envs.vector_infos import Transition, add_joint_masks, make_infos
-from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
-from mapp_env.validation import check_choice, check_count
-
-try:
-    from gymnasium.vector import AutoresetMode
-except ImportError:  # Gymnasium 1.0 has the next-step mode alone, and no name for it
-    from enum import Enum
-
-    class AutoresetMode(Enum):  # type: ignore[no-redef]
-        """The modes of Gymnasium 1.1 and later."""
-
-        NEXT_STEP = "NextStep"
-        SAME_STEP = "SameStep"
-        DISABLED = "Disabled"
-
+from mapp_env.validation import check_count
 
 __all__ = ["MAX_ENVS", "MappVectorEnv", "make_vec"]
 
 MAX_ENVS = 1 << 20
-
-VECTOR_RENDER_MODES = ("rgb_array", "ansi")
 
 
 class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[Any]]):
@@ -77,40 +60,17 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         If an argument is invalid.
     """
 
-    def __init__(
-        self,
-        num_envs: int,
-        grid: str | os.PathLike[str] | Grid = "paper-7x7",
-        n_agents: int = 3,
-        n_landmarks: int = 5,
-        max_cycles: int = 50,
-        reward: str = "manhattan",
-        observation: str = "global",
-        allow_wait: bool = False,
-        render_mode: str | None = None,
-        central_action: str = "multi",
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    ) -> None:
+    @takes(BatchTask)
+    def __init__(self, num_envs: int, task: BatchTask) -> None:
         self.num_envs = check_count("num_envs", num_envs, 1, MAX_ENVS)
-        task = Task(
-            find_grid(grid),
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            reward,
-            observation,
-            allow_wait,
-            render_mode,
-        )
-        self.single_action_space, self.joint_actions = central_action_space(task, central_action)
+        self.single_action_space, self.joint_actions = central_action_space(task)
         self._n_joint_actions = 0 if self.joint_actions is None else len(self.joint_actions)
         task.check_memory(self.num_envs, self._n_joint_actions)
-        self.task = task
-        check_choice("render_mode", task.render_mode, (None, *VECTOR_RENDER_MODES))
-        self.autoreset_mode = _find_mode(autoreset_mode)
+        self.task: Task = task
+        self.autoreset_mode = AutoresetMode(task.autoreset_mode)
         self.metadata = {
             **CentralEnv.metadata,
-            "render_modes": list(VECTOR_RENDER_MODES),
+            "render_modes": list(BATCH_RENDER_MODES),
             "autoreset_mode": self.autoreset_mode,
         }
         self.render_mode = task.render_mode
@@ -134,17 +94,12 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
 
     @property
     def max_cycles(self) -> int:
-        """Step at which an episode is truncated (R7).
-
-        May be assigned, for all rows: a row's episode keeps the limit that it was reset with.
-        """
+        """Step at which an episode is truncated (R7); may be assigned, from the next reset on."""
         return self._rows.max_cycles
 
     @max_cycles.setter
     def max_cycles(self, value: int) -> None:
         self._rows.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
-
-    # -- seeds -------------------------------------------------------------------------
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
@@ -157,8 +112,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """The generator of each row; up to 64 words of it may have been fetched ahead."""
         self._seeds.seed(None, [])
         return tuple(self._seeds.generators)
-
-    # -- episodes ----------------------------------------------------------------------
 
     def reset(
         self,
@@ -244,19 +197,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         return (*transition[:4], make_infos(transition, self._n_joint_actions))
 
     def advance(self, actions: NDArray[np.integer[Any]]) -> Transition:
-        """Do what :meth:`step` does, and leave the infos to the caller.
-
-        Gymnasium's infos of the rows that ended are a seventh of a same-step step of 4,096 rows;
-        adapters that give theirs in another form begin here.
-
-        Parameters
-        ----------
-        actions : ndarray of int
-            As for :meth:`step`.
-
-        Returns
-        -------
-        Transition
+        """Do what :meth:`step` does, but for the infos: adapters give theirs in another form.
 
         Raises
         ------
@@ -307,8 +248,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """Start an episode on a random problem in some rows."""
         self._rows.start(indices, draw_problems(self.task, self._seeds.next_words(indices)))
 
-    # -- checks ------------------------------------------------------------------------
-
     def _read_actions(self, actions: Any) -> NDArray[np.int64]:
         """Return each agent's action in each row, shape (B, N)."""
         joint = self.joint_actions is not None
@@ -335,8 +274,6 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 f"got {np.asarray(actions).flat[bad]}"
             )
         return array if self.joint_actions is None else self.joint_actions[array]
-
-    # -- pictures ----------------------------------------------------------------------
 
     def render(self) -> tuple[Any, ...] | None:
         """Return a picture of each row: arrays for "rgb_array", strings for "ansi".
@@ -402,17 +339,10 @@ def make_gymnasium_vec(
     Raises
     ------
     ValueError
-        If an argument is not as said.
+        If an argument is invalid.
     """
     envs = MappVectorEnv(num_envs, **{"central_action": "auto", **arguments})
     if max_episode_steps not in (None, -1):
         name = "max_episode_steps"
         envs._rows.longest = check_count(name, max_episode_steps, 1, np.iinfo(np.int64).max)
     return envs
-
-
-def _find_mode(mode: object) -> AutoresetMode:
-    if isinstance(mode, AutoresetMode):
-        return mode
-    names = [each.value for each in AutoresetMode]
-    return AutoresetMode(check_choice("autoreset_mode", mode, names))
