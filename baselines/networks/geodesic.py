@@ -12,7 +12,7 @@ from baselines.networks.layers import Head, encode, linear
 from mapp_env import Grid
 from mapp_env.engine.loops import observe_rows
 from mapp_env.engine.observation import N_FEATURES, Observation
-from mapp_env.engine.rules import ALL_PAIRS, cell_table
+from mapp_env.engine.task import make_world
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.validation import check_choice, check_count
 
@@ -63,7 +63,8 @@ class GeodesicNetwork(Network):
     def __init__(self, spec: GeodesicSpec, generator: torch.Generator | None = None) -> None:
         super().__init__(spec)
         grid = Grid.from_text(spec.grid)
-        self.table, self.distances = cell_table(grid), grid.distances
+        world = make_world(grid, spec.n_agents, spec.n_landmarks, observation=Observation.GEODESIC)
+        self.world = tuple(world)
         units = spec.code_units
         self.landmark = nn.Sequential(
             linear(N_FEATURES, units, generator),
@@ -88,14 +89,9 @@ class GeodesicNetwork(Network):
         observe_rows(
             observations[:, : n + 2 * k].astype(np.int32),
             np.arange(n_rows),
-            n,
-            k,
-            int(Observation.GEODESIC),
-            self.table,
-            self.distances,
-            ALL_PAIRS,
             views,
             np.empty((n_rows, n, self.spec.n_actions), np.int8),
+            self.world,
         )
         agents = observations[:, n + 2 * k :].argmax(axis=1)
         return (views[np.arange(n_rows), agents].reshape(n_rows, k, N_FEATURES),)

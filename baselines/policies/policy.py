@@ -53,9 +53,9 @@ class NetworkPolicy:
         """
         spec = self.spec
         checked = check_observations(observations, spec.n_agents, spec.n_landmarks, spec.n_cells)
-        device = next(self.network.parameters()).device
+        given = torch.from_numpy(checked).to(self.network.device)
         with torch.inference_mode():
-            return greedy_actions(self.network(torch.from_numpy(checked).to(device)), spec)
+            return greedy_actions(self.network(given), spec)
 
 
 def save_policy(

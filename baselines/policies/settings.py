@@ -7,7 +7,7 @@ from typing import NamedTuple
 from baselines.policies.policy import NetworkPolicy, find_weights, load_policy
 from baselines.runs.folder import CONFIG_FILE, read_config
 from mapp_env import Grid, Problem
-from mapp_env.engine.rules import N_ACTIONS
+from mapp_env.engine.state import N_ACTIONS
 from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, MAX_LANDMARKS
 from mapp_env.validation import check_count
 

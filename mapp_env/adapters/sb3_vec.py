@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv
 from mapp_env.engine.seeds import spread_seed
+from mapp_env.engine.sources import check_options
 from mapp_env.envs.central_env import central_action_masks
 from mapp_env.envs.vector_env import MappVectorEnv
 from mapp_env.envs.vector_infos import Transition
@@ -151,7 +152,7 @@ class MappSb3VecEnv(RowsVecEnv):
                     f"options[{row}] must be a dict with 'landmarks' alone, got {describe(wishes)}"
                 )
             try:
-                problem = self.engine.task.check_options(dict(wishes))
+                problem = check_options(self.engine.task, dict(wishes))
             except ValueError as error:
                 raise ValueError(f"options[{row}]: {error}") from error
             if problem is None:

@@ -1,4 +1,8 @@
-"""The loops that run the rules over rows, compiled."""
+"""The loops that run the rules over rows, compiled.
+
+Python hands them the world as a plain tuple (see :data:`mapp_env.engine.state.Packed`), and arrays
+to write to: kernels allocate nothing. Below, B rows have N agents and K landmarks on C cells.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +11,9 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.observation import observe_row
-from mapp_env.engine.rules import measure_row, reset_row, step_row
+from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
+from mapp_env.engine.state import Packed, World, new_rows, split, split_row, world_at
 from mapp_env.grid import fill_distances
-from mapp_env.problem import draw_landmarks
 
 __all__ = [
     "fill_fields",
@@ -21,53 +25,8 @@ __all__ = [
     "reset_rows",
     "step_and_observe",
     "step_rows",
+    "visit_rows",
 ]
-
-
-@kernel
-def _step_and_observe(
-    row: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    max_cycles: int,
-    n_agents: int,
-    n_landmarks: int,
-    reward: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    view_distances: NDArray[np.int32],
-    first_view_field: int,
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
-) -> tuple[float, bool, bool]:
-    """Do what :func:`step_and_observe` does with actions that have been looked at.
-
-    The rules index a table with them, and what is no action would leave its memory.
-    """
-    result: tuple[float, bool, bool] = step_row(
-        row,
-        actions,
-        n_agents,
-        n_landmarks,
-        max_cycles,
-        reward,
-        table,
-        distances,
-        first_field,
-    )
-    observe_row(
-        row,
-        n_agents,
-        n_landmarks,
-        kind,
-        table,
-        view_distances,
-        first_view_field,
-        views,
-        masks,
-    )
-    return result
 
 
 @kernel
@@ -75,46 +34,26 @@ def step_and_observe(
     row: NDArray[np.int32],
     actions: NDArray[np.int64],
     max_cycles: int,
-    n_agents: int,
-    n_landmarks: int,
-    reward: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    view_distances: NDArray[np.int32],
-    first_view_field: int,
     views: NDArray[np.float32],
     masks: NDArray[np.int8],
+    world: Packed,
 ) -> tuple[float, bool, bool]:
-    """Step a row and look at it; parameters as in ``step_row`` and ``observe_row``.
+    """Step a single row and look at it; parameters as in ``step_row`` and ``observe_row``.
 
     Raises
     ------
     ValueError
-        If ``actions`` are not one an agent, each one that it has; nothing has moved then.
+        If ``actions`` are not one an agent, each one that it has; nothing has moved then. (The
+        rules index a table with them, and what is no action would leave its memory.)
     """
-    if actions.shape[0] != n_agents:
+    own = World(*world)
+    if actions.shape[0] != own.n_agents:
         raise ValueError("actions must hold one action an agent")
-    for agent in range(n_agents):
+    for agent in range(own.n_agents):
         if not 0 <= actions[agent] < masks.shape[1]:
             raise ValueError("actions must be in 0..A-1, A the number of an agent's actions")
-    result: tuple[float, bool, bool] = _step_and_observe(
-        row,
-        actions,
-        max_cycles,
-        n_agents,
-        n_landmarks,
-        reward,
-        kind,
-        table,
-        distances,
-        first_field,
-        view_distances,
-        first_view_field,
-        views,
-        masks,
-    )
+    result: tuple[float, bool, bool] = step_row(row, actions, max_cycles, own)
+    observe_row(row, own, views, masks)
     return result
 
 
@@ -124,147 +63,142 @@ def step_rows(
     actions: NDArray[np.int64],
     skip: NDArray[np.bool_],
     limits: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    reward: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    view_distances: NDArray[np.int32],
-    first_view_field: int,
     rewards: NDArray[np.float64],
     terminations: NDArray[np.bool_],
     truncations: NDArray[np.bool_],
     views: NDArray[np.float32],
     masks: NDArray[np.int8],
+    world: Packed,
 ) -> None:
-    """Step all rows but those of ``skip``, and look at all; parameters as ``step_and_observe``."""
+    """Step all rows but those of ``skip``, with actions that have been looked at; look at all.
+
+    Shapes: (B, ...) of what ``step_row`` and ``observe_row`` take.
+    """
+    common = World(*world)
     for index in range(rows.shape[0]):
-        field = _field_of(index, first_field, n_landmarks)
-        view_field = _field_of(index, first_view_field, n_landmarks)
+        own = world_at(common, index)
         if skip[index]:
             rewards[index] = 0.0
             terminations[index] = False
             truncations[index] = False
-            observe_row(
-                rows[index],
-                n_agents,
-                n_landmarks,
-                kind,
-                table,
-                view_distances,
-                view_field,
-                views[index],
-                masks[index],
-            )
         else:
-            rewards[index], terminations[index], truncations[index] = _step_and_observe(
-                rows[index],
-                actions[index],
-                limits[index],
-                n_agents,
-                n_landmarks,
-                reward,
-                kind,
-                table,
-                distances,
-                field,
-                view_distances,
-                view_field,
-                views[index],
-                masks[index],
+            rewards[index], terminations[index], truncations[index] = step_row(
+                rows[index], actions[index], limits[index], own
             )
+        observe_row(rows[index], own, views[index], masks[index])
 
 
 @kernel
 def observe_rows(
     rows: NDArray[np.int32],
     indices: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
     views: NDArray[np.float32],
     masks: NDArray[np.int8],
+    world: Packed,
 ) -> None:
     """Look at some rows: ``views`` (M, V, F) and ``masks`` (M, N, A) of ``indices`` (M,)."""
+    common = World(*world)
     for place, index in enumerate(indices):
-        field = _field_of(index, first_field, n_landmarks)
-        observe_row(
-            rows[index],
-            n_agents,
-            n_landmarks,
-            kind,
-            table,
-            distances,
-            field,
-            views[place],
-            masks[place],
-        )
-
-
-@kernel
-def _field_of(index: int, first_field: int, n_landmarks: int) -> int:
-    """Return what a row takes for ``first_field``: a line of its own if there are fields."""
-    return first_field if first_field < 0 else index * n_landmarks
+        observe_row(rows[index], world_at(common, index), views[place], masks[place])
 
 
 @kernel
 def reset_rows(
     rows: NDArray[np.int32],
     indices: NDArray[np.int64],
-    words: NDArray[np.uint64],
     landmarks: NDArray[np.int32],
-    candidates: NDArray[np.int32],
     depot: int,
-    n_agents: int,
-    n_landmarks: int,
+    world: Packed,
 ) -> None:
-    """Reset rows on given landmarks, or, where there are words, on landmarks drawn with them."""
+    """Start an episode in the rows of ``indices``, (M,), on ``landmarks``, (M, K)."""
+    common = World(*world)
     for place, index in enumerate(indices):
-        if words.shape[0] > 0:
-            draw_landmarks(words[place], candidates, landmarks[place])
-        reset_row(rows[index], landmarks[place], depot, n_agents, n_landmarks)
+        reset_row(rows[index], landmarks[place], depot, common)
 
 
 @kernel
 def measure_rows(
     rows: NDArray[np.int32],
     indices: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
     costs: NDArray[np.float64],
+    world: Packed,
 ) -> None:
     """Write the costs of some rows, (M, 3): cover time, makespan, total distance (R8)."""
+    common = World(*world)
     for place, index in enumerate(indices):
-        cover_time, makespan, distance = measure_row(rows[index], n_agents, n_landmarks, table)
+        cover_time, makespan, distance = measure_row(rows[index], common)
         costs[place, 0] = cover_time
         costs[place, 1] = makespan
         costs[place, 2] = distance
+
+
+def visit_rows(
+    world: World,
+    cells: NDArray[np.integer],
+    landmarks: NDArray[np.integer],
+    visited: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return what the rules make of agents that have moved, whatever brought them there.
+
+    Parameters
+    ----------
+    world : World
+        Sizes, reward and distances, from :func:`mapp_env.engine.task.make_world`.
+    cells : ndarray of int, shape (B, N)
+        Where the agents stand after the move.
+    landmarks : ndarray of int, shape (B, K)
+        The landmarks' cells.
+    visited : ndarray of bool or int, shape (B, K)
+        Which of them had been visited before.
+
+    Returns
+    -------
+    visited : ndarray of bool, shape (B, K)
+        With those under an agent (R5).
+    rewards : ndarray of float64, shape (B,)
+        The team reward (R6).
+    terminated : ndarray of bool, shape (B,)
+        Whether all are visited (R7).
+    """
+    rows = new_rows(len(cells), world.n_agents, world.n_landmarks)
+    state = split(rows, world.n_agents, world.n_landmarks)
+    state.cells[:], state.landmarks[:], state.visited[:] = cells, landmarks, visited
+    rewards, terminated = np.empty(len(rows)), np.empty(len(rows), np.bool_)
+    _visit_rows(rows, rewards, terminated, tuple(world))
+    return state.visited.astype(np.bool_), rewards, terminated
+
+
+@kernel
+def _visit_rows(
+    rows: NDArray[np.int32],
+    rewards: NDArray[np.float64],
+    terminated: NDArray[np.bool_],
+    world: Packed,
+) -> None:
+    common = World(*world)
+    for index in range(rows.shape[0]):
+        state = split_row(rows[index], common.n_agents, common.n_landmarks)
+        rewards[index], terminated[index] = visit_row(state, world_at(common, index))
 
 
 @kernel
 def fill_fields(
     rows: NDArray[np.int32],
     indices: NDArray[np.int64],
-    table: NDArray[np.int32],
-    n_agents: int,
-    n_landmarks: int,
     fields: NDArray[np.int32],
     queue: NDArray[np.int32],
+    world: Packed,
 ) -> None:
     """Write the steps from every landmark of some rows: how grids too large for all pairs do it.
 
-    Shapes: ``rows`` (B, row_length), ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,).
+    Shapes: ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,).
     """
+    common = World(*world)
     for index in indices:
-        for landmark in range(n_landmarks):
-            start = rows[index, n_agents + landmark]
-            fill_distances(table, start, fields[index * n_landmarks + landmark], queue)
+        state = split_row(rows[index], common.n_agents, common.n_landmarks)
+        for landmark in range(common.n_landmarks):
+            field = fields[index * common.n_landmarks + landmark]
+            fill_distances(common.table, state.landmarks[landmark], field, queue)
 
 
 @kernel

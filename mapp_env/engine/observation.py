@@ -1,4 +1,4 @@
-"""What agents see: four kinds of observation, all float32, written from rows (see ``dynamics``).
+"""What agents see: four kinds of observation, all float32, written from rows (see ``state``).
 
 ``global``, shape (N + 2K,)
     R9, the paper's 13 numbers: all agents' cells, all landmarks' cells, visited flags; the same
@@ -26,17 +26,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.engine.rules import COL, FAR, HOME, N_ACTIONS, ROW, WAIT, WALL, landmark_source
+from mapp_env.engine.state import (
+    ALL_PAIRS,
+    COL,
+    FAR,
+    HOME,
+    N_ACTIONS,
+    NO_DISTANCES,
+    ROW,
+    WAIT,
+    WALL,
+    State,
+    World,
+    landmark_source,
+    path_distances,
+    split,
+    split_row,
+    state_length,
+)
 from mapp_env.grid import Grid
 
-__all__ = ["Observation", "View", "observe_row", "view"]
+__all__ = ["N_FEATURES", "Observation", "View", "observe_row", "view", "view_distances"]
 
 N_PLANES = 6
 N_FEATURES = 4 + N_ACTIONS
 
 
 class Observation(IntEnum):
-    """The kinds of observation; :func:`observe_row` takes their numbers."""
+    """The kinds of observation."""
 
     GLOBAL = 0
     OWN_FIRST = 1
@@ -64,127 +81,105 @@ def view(kind: Observation, grid: Grid, n_agents: int, n_landmarks: int) -> View
         return View(
             (N_FEATURES * n_landmarks,), np.tile(low, n_landmarks), np.tile(high, n_landmarks)
         )
-    size = n_agents + 2 * n_landmarks
+    size = state_length(n_agents, n_landmarks)
     high = np.full(size, grid.n_cells - 1, np.float32)
-    high[n_agents + n_landmarks :] = 1
+    split(high, n_agents, n_landmarks).visited[:] = 1
     return View((size,), np.zeros(size, np.float32), high)
+
+
+def view_distances(
+    kind: Observation, grid: Grid, fields: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], int]:
+    """Return the distances that an observation looks up, as ``rules.reward_distances`` does."""
+    if kind == Observation.GEODESIC:
+        return path_distances(grid, fields)
+    return NO_DISTANCES, ALL_PAIRS
 
 
 @kernel
 def observe_row(
-    row: NDArray[np.int32],
-    n_agents: int,
-    n_landmarks: int,
-    kind: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
+    row: NDArray[np.int32], world: World, views: NDArray[np.float32], masks: NDArray[np.int8]
 ) -> None:
     """Write the observations and action masks of all agents.
 
     Parameters
     ----------
-    row : ndarray of int32, shape (row_length,)
+    row : ndarray of int32
         What is looked at.
-    n_agents, n_landmarks, kind : int
-        Sizes of the problem and an :class:`Observation`.
-    table, distances, first_field
-        As in :func:`mapp_env.engine.rules.step_row`; distances are read for ``GEODESIC`` only.
+    world : World
+        What is looked up.
     views : ndarray of float32, shape (V, F)
         Observations, flat. V is N, or 1 to write ``GLOBAL`` once and not for each agent.
     masks : ndarray of int8, shape (N, A)
         Action masks: 0 for a move that would bump, 1 for any other and for waiting.
     """
-    for agent in range(n_agents):
-        cell = row[agent]
+    state = split_row(row, world.n_agents, world.n_landmarks)
+    for agent in range(world.n_agents):
+        cell = state.cells[agent]
         for action in range(N_ACTIONS):
-            masks[agent, action] = table[np.uint32(cell), action] != cell
+            masks[agent, action] = world.table[np.uint32(cell), action] != cell
         if masks.shape[1] > WAIT:
             masks[agent, WAIT] = 1
     for agent in range(views.shape[0]):
-        if kind == Observation.GLOBAL:
-            for place in range(n_agents + 2 * n_landmarks):
-                views[agent, place] = row[place]
-        elif kind == Observation.OWN_FIRST:
-            _write_own_first(row, agent, n_agents, n_landmarks, views[agent])
-        elif kind == Observation.PLANES:
-            _write_planes(row, agent, n_agents, n_landmarks, table, views[agent])
+        if world.observation == Observation.GLOBAL:
+            for place in range(state.head.shape[0]):
+                views[agent, place] = state.head[place]
+        elif world.observation == Observation.OWN_FIRST:
+            _write_own_first(state, agent, views[agent])
+        elif world.observation == Observation.PLANES:
+            _write_planes(state, world, agent, views[agent])
         else:
-            _write_geodesic(
-                row, agent, n_agents, n_landmarks, table, distances, first_field, views[agent]
-            )
+            _write_geodesic(state, world, agent, views[agent])
 
 
 @kernel
-def _write_own_first(
-    row: NDArray[np.int32],
-    agent: int,
-    n_agents: int,
-    n_landmarks: int,
-    out: NDArray[np.float32],
-) -> None:
-    out[0] = row[agent]
+def _write_own_first(state: State, agent: int, out: NDArray[np.float32]) -> None:
+    out[0] = state.cells[agent]
     for other in range(agent):
-        out[other + 1] = row[other]
-    for place in range(agent + 1, n_agents + 2 * n_landmarks):
-        out[place] = row[place]
+        out[other + 1] = state.cells[other]
+    for place in range(agent + 1, state.head.shape[0]):
+        out[place] = state.head[place]
 
 
 @kernel
-def _write_planes(
-    row: NDArray[np.int32],
-    agent: int,
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
-    out: NDArray[np.float32],
-) -> None:
+def _write_planes(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
+    n_agents, table = world.n_agents, world.table
     n_cells = table.shape[0]
     own, others, unvisited, visited = 2 * n_cells, 3 * n_cells, 4 * n_cells, 5 * n_cells
     out[own:] = 0
     for cell in range(n_cells):
         out[cell] = table[cell, WALL]
         out[n_cells + cell] = table[cell, HOME] == 0
-    out[own + row[agent]] = 1
+    out[own + state.cells[agent]] = 1
     for other in range(n_agents):
         if other != agent:
             together = 0
             for another in range(n_agents):
-                together += another != agent and row[another] == row[other]
-            out[others + row[other]] = together / (n_agents - 1)
-    for landmark in range(n_landmarks):
-        plane = visited if row[n_agents + n_landmarks + landmark] else unvisited
-        out[plane + row[n_agents + landmark]] = 1
+                together += another != agent and state.cells[another] == state.cells[other]
+            out[others + state.cells[other]] = together / (n_agents - 1)
+    for landmark in range(world.n_landmarks):
+        plane = visited if state.visited[landmark] else unvisited
+        out[plane + state.landmarks[landmark]] = 1
 
 
 @kernel
-def _write_geodesic(
-    row: NDArray[np.int32],
-    agent: int,
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
-    out: NDArray[np.float32],
-) -> None:
+def _write_geodesic(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
+    n_agents, table, distances = world.n_agents, world.table, world.view_distances
     n_cells = table.shape[0]
     scale = table[n_cells - 1, ROW] + 1 + table[n_cells - 1, COL] + 1  # rows + cols
-    cell = row[agent]
-    for landmark in range(n_landmarks):
-        source = landmark_source(row, n_agents, landmark, first_field)
+    cell = state.cells[agent]
+    for landmark in range(world.n_landmarks):
+        source = landmark_source(state, landmark, world.first_view_field)
         own = distances[source, cell]
         nearest = FAR
         before = 0
         for other in range(n_agents):
             if other != agent:
-                distance = distances[source, row[other]]
+                distance = distances[source, state.cells[other]]
                 nearest = min(nearest, distance)
                 before += distance < own or (distance == own and other < agent)
         place = N_FEATURES * landmark
-        out[place] = 1 - row[n_agents + n_landmarks + landmark]
+        out[place] = 1 - state.visited[landmark]
         out[place + 1] = own / scale
         out[place + 2] = min(nearest, n_cells) / scale
         out[place + 3] = before / max(n_agents - 1, 1)

@@ -1,4 +1,4 @@
-"""Problems in progress: the state of B rows."""
+"""Problems in progress: B rows of one task."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mapp_env.engine.loops import (
     reset_rows,
     step_rows,
 )
-from mapp_env.engine.rules import row_length
 from mapp_env.engine.scene import TRAIL_MOVES, Scene
+from mapp_env.engine.state import new_rows, split
 from mapp_env.engine.task import Task
 from mapp_env.problem import MAX_CYCLES
 
@@ -30,7 +30,7 @@ class Rows:
     Parameters
     ----------
     task : Task
-        What is played.
+        What is simulated.
     n_rows : int
         Number of problems B.
     n_views : int
@@ -38,8 +38,12 @@ class Rows:
 
     Attributes
     ----------
-    state : ndarray of int32, shape (B, row_length)
-        See :mod:`mapp_env.engine.rules`.
+    array : ndarray of int32, shape (B, L)
+        The rows.
+    state : State
+        Their parts by name.
+    world : tuple
+        What the kernels look up, see :data:`mapp_env.engine.state.Packed`.
     limits : ndarray of int64, shape (B,)
         Step limit of each row's episode.
     max_cycles : int
@@ -51,43 +55,34 @@ class Rows:
     def __init__(self, task: Task, n_rows: int, n_views: int) -> None:
         self.task = task
         self.n_rows = n_rows
-        self.state = np.zeros((n_rows, row_length(task.n_agents, task.n_landmarks)), np.int32)
+        self.array = new_rows(n_rows, task.n_agents, task.n_landmarks)
         self.limits = np.full(n_rows, task.max_cycles, np.int64)
         self.max_cycles = task.max_cycles
         self.longest = MAX_CYCLES
-        self._every_row = np.arange(n_rows)
-        # What the kernels take at every call, gathered once: for a single row, looking it up would
-        # take longer than a step.
-        n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
-        self._fields = np.empty((n_fields, task.grid.n_cells), np.int32)
-        self.sizes = (task.n_agents, task.n_landmarks)
-        self.reward = int(task.reward_kind)
-        self.kind = int(task.observation_kind)
-        self.tables = self._find_tables()
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
+        n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
+        self._fields = np.empty((n_fields, task.grid.n_cells), np.int32)
+        self._every_row = np.arange(n_rows)
         self._looked_at: NDArray[np.int64] | None = None
         # Pictures show where agents have been: their cells at each step, for each row.
         self._trails: list[deque[tuple[int, ...]]] | None = None
         if task.render_mode is not None:
             self._trails = [deque(maxlen=TRAIL_MOVES + 1) for _ in range(n_rows)]
+        self._bind()
 
-    def _find_tables(self) -> tuple[Any, ...]:
-        """Return the table and the distances of reward and views that the kernels read."""
-        task, fields = self.task, self._fields
-        return (task.table, *task.reward_distances(fields), *task.view_distances(fields))
+    def _bind(self) -> None:
+        """Gather what is read at every step: for a single row, to look it up would take longer."""
+        self.state = split(self.array, self.task.n_agents, self.task.n_landmarks)
+        self.world = tuple(self.task.world(self._fields))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy; what the kernels read must be views of it, not copies of views."""
         self.__dict__.update(state)
-        self.tables = self._find_tables()
+        self._bind()
 
     def start(
-        self,
-        indices: NDArray[np.int64],
-        words: NDArray[np.uint64] | None,
-        landmarks: NDArray[np.int32] | None = None,
-        limit: int | None = None,
+        self, indices: NDArray[np.int64], landmarks: NDArray[np.int32], limit: int | None = None
     ) -> None:
         """Start an episode in some rows.
 
@@ -95,30 +90,16 @@ class Rows:
         ----------
         indices : ndarray of int64, shape (M,)
             The rows.
-        words : ndarray of uint64, shape (M,), or None
-            Random words that the landmarks are drawn from.
-        landmarks : ndarray of int32, shape (M, K), optional
-            The landmarks, if they are not to be drawn.
+        landmarks : ndarray of int32, shape (M, K)
+            Their landmarks, from :mod:`mapp_env.engine.sources`.
         limit : int, optional
             Step limit of these episodes; by default ``max_cycles``.
         """
-        task = self.task
-        if landmarks is None:
-            landmarks = np.empty((len(indices), task.n_landmarks), np.int32)
-        else:
-            words = None
-        reset_rows(
-            self.state,
-            indices,
-            np.empty(0, np.uint64) if words is None else words,
-            landmarks,
-            task.grid.reachable,
-            task.grid.depot,
-            *self.sizes,
-        )
-        if task.needs_fields:
-            queue = np.empty(task.grid.n_cells, np.int32)
-            fill_fields(self.state, indices, task.table, *self.sizes, self._fields, queue)
+        grid = self.task.grid
+        reset_rows(self.array, indices, landmarks, grid.depot, self.world)
+        if len(self._fields):
+            queue = np.empty(grid.n_cells, np.int32)
+            fill_fields(self.array, indices, self._fields, queue, self.world)
         self.limits[indices] = min(self.max_cycles if limit is None else limit, self.longest)
         if self._trails is not None:
             for index in indices:
@@ -178,24 +159,11 @@ class Rows:
         truncations = np.empty(self.n_rows, np.bool_)
         views = np.empty((self.n_rows, *self.views_shape), np.float32)
         masks = np.empty((self.n_rows, *self.masks_shape), np.int8)
-        step_rows(
-            self.state,
-            actions,
-            skip,
-            self.limits,
-            *self.sizes,
-            self.reward,
-            self.kind,
-            *self.tables,
-            rewards,
-            terminations,
-            truncations,
-            views,
-            masks,
-        )
+        found = rewards, terminations, truncations, views, masks
+        step_rows(self.array, actions, skip, self.limits, *found, self.world)
         if self._trails is not None:
             self.extend_trails(np.flatnonzero(~skip))
-        return rewards, terminations, truncations, views, masks
+        return found
 
     def observe(
         self, indices: NDArray[np.int64] | None = None
@@ -204,44 +172,32 @@ class Rows:
         indices = self._every_row if indices is None else indices
         views = np.empty((len(indices), *self.views_shape), np.float32)
         masks = np.empty((len(indices), *self.masks_shape), np.int8)
-        observe_rows(
-            self.state,
-            indices,
-            *self.sizes,
-            self.kind,
-            self.tables[0],
-            *self.tables[3:],
-            views,
-            masks,
-        )
+        observe_rows(self.array, indices, views, masks, self.world)
         return views, masks
 
     def measure(self, indices: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return cover time, makespan and total distance (R8), inf if unsolved, shape (M, 3)."""
         costs = np.empty((len(indices), 3))
-        measure_rows(self.state, indices, *self.sizes, self.task.table, costs)
+        measure_rows(self.array, indices, costs, self.world)
         return costs
 
     def extend_trails(self, indices: NDArray[np.int64]) -> None:
         """Note where the agents of some rows are, for pictures; nothing without a render mode."""
         if self._trails is not None:
             for index in indices:
-                cells = self.state[index, : self.task.n_agents].tolist()
-                self._trails[index].append(tuple(cells))
+                self._trails[index].append(tuple(self.state.cells[index].tolist()))
 
     def scene(self, index: int) -> Scene:
         """Return what a picture of a row shows."""
-        task = self.task
-        row = self.state[index].tolist()
-        visited = task.n_agents + task.n_landmarks
-        cells = tuple(row[: task.n_agents])
+        state = self.state
+        cells = tuple(state.cells[index].tolist())
         trail = [cells] if self._trails is None else self._trails[index]
         return Scene(
-            grid=task.grid,
-            landmarks=tuple(row[task.n_agents : visited]),
-            visited=tuple(bool(flag) for flag in row[visited : task.state_length]),
+            grid=self.task.grid,
+            landmarks=tuple(state.landmarks[index].tolist()),
+            visited=tuple(state.visited[index].astype(bool).tolist()),
             cells=cells,
             trails=tuple(zip(*trail, strict=True)),
-            step=row[task.state_length],
+            step=int(state.step[index, 0]),
             max_cycles=int(self.limits[index]),
         )

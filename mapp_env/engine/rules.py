@@ -1,209 +1,161 @@
-"""The rules of version 0 (R2 to R8), written once, as kernels over one row.
+"""The rules of version 0 (R2 to R8), written once, as kernels over one row (see ``state``).
 
-A *row* is one problem in progress, an int32 vector for N agents and K landmarks::
-
-    [ agents' cells (N) | landmarks' cells (K) | visited flags (K) | step (1)
-    | cells moved (N) | at the last claim: cell (N), cells moved (N), step (N) ]
-
-Its head is the paper's observation (R9), its tail is what the metrics (R8) need. A *table* turns
-a grid into one line of int32 a cell::
-
-    [ next cell for left, right, up, down, wait | row, col | steps home | 1 for a wall ]
-
-so that borders and walls vanish from the rules.
-
-Cells and actions are indexed as ``uint32``: a signed index costs a test for a negative one, which
-took a quarter of a batched step.
-
-With ``NUMBA_DISABLE_JIT=1`` the same source runs as plain Python.
+With ``NUMBA_DISABLE_JIT=1`` the same source runs as plain Python. The rules of a second game would
+stand in a file beside this one, over a row of their own, and share :func:`move_row`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.engine.state import (
+    ALL_PAIRS,
+    BY_COORDINATES,
+    COL,
+    FAR,
+    HOME,
+    NO_DISTANCES,
+    ROW,
+    State,
+    World,
+    landmark_source,
+    path_distances,
+    split_row,
+)
 from mapp_env.grid import Grid
 
 __all__ = [
-    "ALL_PAIRS",
-    "BY_COORDINATES",
-    "COL",
-    "FAR",
-    "HOME",
-    "MAX_TABLE_CELLS",
-    "NO_DISTANCES",
-    "N_ACTIONS",
-    "ROW",
-    "WAIT",
-    "WALL",
     "Reward",
-    "cell_table",
-    "landmark_source",
-    "manhattan_table",
     "measure_row",
+    "move_row",
     "reset_row",
-    "row_length",
+    "reward_distances",
     "step_row",
+    "visit_row",
 ]
-
-N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
-WAIT = 4
-ROW, COL, HOME, WALL = 5, 6, 7, 8  # columns of a table, after the five moves
-
-# Where the distances of a row's landmarks stand: from this line of `distances` on, or
-ALL_PAIRS = -1  # in `distances`, in the line of each landmark's cell
-BY_COORDINATES = -2  # nowhere: Manhattan distances are computed from rows and columns
 
 MAX_TABLE_CELLS = (
     256  # largest grid for a table of Manhattan distances: it should stay in the cache
 )
 
-# Distances are read-only arrays without exception: numba would compile a second version of every
-# kernel for others.
-NO_DISTANCES = np.zeros((1, 1), np.int32)
-NO_DISTANCES.flags.writeable = False
-
-FAR = np.int32(1 << 30)  # more than any distance on a grid
-
 
 class Reward(IntEnum):
-    """The kinds of team reward (R6); :func:`step_row` takes their numbers."""
+    """The kinds of team reward (R6)."""
 
     MANHATTAN = 0
     GEODESIC = 1
     STEP = 2
 
 
-def row_length(n_agents: int, n_landmarks: int) -> int:
-    """Return the number of int32 in a row."""
-    return 5 * n_agents + 2 * n_landmarks + 1
+def reward_distances(
+    kind: Reward, grid: Grid, fields: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], int]:
+    """Return the distances that a reward looks up, shape (S, C), and the first landmark's line.
 
-
-def cell_table(grid: Grid) -> NDArray[np.int32]:
-    """Return the grid as the kernels read it, shape (C, 9) int32."""
-    cells = np.arange(grid.n_cells)
-    row, col = np.divmod(cells, grid.cols)
-    columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel()]
-    table = np.column_stack(columns).astype(np.int32)
-    table.flags.writeable = False
-    return table
-
-
-def manhattan_table(grid: Grid) -> NDArray[np.int32]:
-    """Return the Manhattan distances between all pairs of cells, shape (C, C) int32."""
+    Parameters are those of :func:`mapp_env.engine.task.make_world`.
+    """
+    if kind == Reward.GEODESIC:
+        return path_distances(grid, fields)
+    if grid.n_cells > MAX_TABLE_CELLS:
+        return NO_DISTANCES, BY_COORDINATES
     row, col = np.divmod(np.arange(grid.n_cells, dtype=np.int32), grid.cols)
     table = abs(row[:, None] - row) + abs(col[:, None] - col)
     table.flags.writeable = False
-    return table
+    return table, ALL_PAIRS
 
 
-# -- the rules -----------------------------------------------------------
+@kernel
+def reset_row(
+    row: NDArray[np.int32], landmarks: NDArray[np.int32], depot: int, world: World
+) -> None:
+    """Start an episode (R2) on landmarks that satisfy its conditions, shape (K,)."""
+    row[:] = 0
+    state = split_row(row, world.n_agents, world.n_landmarks)
+    state.cells[:] = depot
+    for landmark in range(world.n_landmarks):
+        state.landmarks[landmark] = landmarks[landmark]
 
 
 @kernel
 def step_row(
-    row: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    max_cycles: int,
-    reward: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    first_field: int,
+    row: NDArray[np.int32], actions: NDArray[np.int64], max_cycles: int, world: World
 ) -> tuple[float, bool, bool]:
     """Carry out one joint action.
 
     Parameters
     ----------
-    row : ndarray of int32, shape (row_length,)
+    row : ndarray of int32
         Changed in place.
     actions : ndarray of int64, shape (N,)
         Valid actions, one an agent.
-    n_agents, n_landmarks, max_cycles, reward : int
-        Sizes of the problem, the step limit and a :class:`Reward`.
-    table : ndarray of int32, shape (C, 9)
-        From :func:`cell_table`.
-    distances : ndarray of int32, shape (S, C)
-        Distances from sources to cells: Manhattan, or shortest paths for the geodesic reward.
-    first_field : int
-        Line of ``distances`` that belongs to the first landmark, ``ALL_PAIRS`` or, for Manhattan
-        distances, ``BY_COORDINATES``.
+    max_cycles : int
+        The step limit.
+    world : World
+        What is looked up.
 
     Returns
     -------
     float, bool, bool
         The team reward (R6), terminated and truncated (R7).
     """
-    step = _move(row, actions, n_agents, n_landmarks, table)
-    if first_field == BY_COORDINATES:
-        unvisited, distance = _visit(
-            row, n_agents, n_landmarks, step, _nearest_by_coordinates, table, first_field
-        )
-    else:
-        unvisited, distance = _visit(
-            row, n_agents, n_landmarks, step, _nearest_by_table, distances, first_field
-        )
-    if unvisited == 0:
-        return 0.0, True, False
-    if reward == Reward.STEP:
-        distance = 1
-    return -float(distance), False, step >= max_cycles
+    state = split_row(row, world.n_agents, world.n_landmarks)
+    move_row(state, actions, world)
+    reward, terminated = visit_row(state, world)
+    return reward, terminated, not terminated and state.step[0] >= max_cycles
 
 
 @kernel
-def _move(
-    row: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
-) -> int:
-    """Move all agents at once (R3, R4) and return the number of this step."""
-    clock = n_agents + 2 * n_landmarks
-    moved = clock + 1
-    row[clock] += 1
-    for agent in range(n_agents):
-        cell = row[agent]
-        to = table[np.uint32(cell), np.uint32(actions[agent])]
-        row[agent] = to
-        row[moved + agent] += to != cell
-    return int(row[clock])
+def move_row(state: State, actions: NDArray[np.int64], world: World) -> None:
+    """Move all agents at once (R3, R4)."""
+    state.step[0] += 1
+    for agent in range(world.n_agents):
+        cell = state.cells[agent]
+        to = world.table[np.uint32(cell), np.uint32(actions[agent])]
+        state.cells[agent] = to
+        state.moved[agent] += to != cell
+
+
+@kernel
+def visit_row(state: State, world: World) -> tuple[float, bool]:
+    """Visit the landmarks under agents (R5); return the team reward (R6) and if none is left."""
+    if world.first_field == BY_COORDINATES:
+        unvisited, distance = _visit(
+            state, world, _nearest_by_coordinates, world.table, world.first_field
+        )
+    else:
+        unvisited, distance = _visit(
+            state, world, _nearest_by_table, world.distances, world.first_field
+        )
+    if unvisited == 0:
+        return 0.0, True
+    if world.reward == Reward.STEP:
+        distance = 1
+    return -float(distance), False
 
 
 @kernel
 def _visit(
-    row: NDArray[np.int32],
-    n_agents: int,
-    n_landmarks: int,
-    step: int,
-    nearest: Callable[[NDArray[np.int32], int, int, NDArray[np.int32], int], int],
+    state: State,
+    world: World,
+    nearest: Callable[[State, World, int, NDArray[np.int32], int], int],
     distances: NDArray[np.int32],
     first_field: int,
 ) -> tuple[int, int]:
-    """Visit the landmarks under agents (R5).
-
-    Returns
-    -------
-    int, int
-        How many landmarks are left, and the sum of their distances from the nearest agent (R6).
-    """
-    visited = n_agents + n_landmarks
+    """Return how many landmarks are left, and the sum of their distances from the nearest agent."""
     unvisited = 0
     total = 0
-    for landmark in range(n_landmarks):
+    for landmark in range(world.n_landmarks):
         # All landmarks alike, visited or not: whether one is visited is as good as random to the
         # processor, and a branch on it would cost more than a distance.
-        flag = row[visited + landmark]
-        distance = nearest(row, n_agents, landmark, distances, first_field)
+        flag = state.visited[landmark]
+        distance = nearest(state, world, landmark, distances, first_field)
         if (distance == 0) & (flag == 0):
-            _claim(row, n_agents, n_landmarks, landmark, step)
+            _claim(state, landmark)
             flag = np.int32(1)
         left = 1 - flag
         unvisited += left
@@ -213,108 +165,63 @@ def _visit(
 
 @kernel
 def _nearest_by_table(
-    row: NDArray[np.int32],
-    n_agents: int,
-    landmark: int,
-    distances: NDArray[np.int32],
-    first_field: int,
+    state: State, world: World, landmark: int, distances: NDArray[np.int32], first_field: int
 ) -> int:
     """Return the distance from the nearest agent to a landmark, looked up."""
-    source = np.uint32(landmark_source(row, n_agents, landmark, first_field))
+    source = np.uint32(landmark_source(state, landmark, first_field))
     least = FAR
-    for agent in range(n_agents):
-        least = min(least, distances[source, np.uint32(row[agent])])
+    for agent in range(world.n_agents):
+        least = min(least, distances[source, np.uint32(state.cells[agent])])
     return least  # type: ignore[return-value]
 
 
 @kernel
 def _nearest_by_coordinates(
-    row: NDArray[np.int32],
-    n_agents: int,
-    landmark: int,
-    table: NDArray[np.int32],
-    first_field: int,
+    state: State, world: World, landmark: int, table: NDArray[np.int32], first_field: int
 ) -> int:
     """Return the Manhattan distance from the nearest agent to a landmark, computed."""
-    cell = np.uint32(row[n_agents + landmark])
+    cell = np.uint32(state.landmarks[landmark])
     least = FAR
-    for agent in range(n_agents):
-        at = np.uint32(row[agent])
+    for agent in range(world.n_agents):
+        at = np.uint32(state.cells[agent])
         distance = abs(table[at, ROW] - table[cell, ROW]) + abs(table[at, COL] - table[cell, COL])
         least = min(least, np.int32(distance))
     return least  # type: ignore[return-value]
 
 
 @kernel
-def _claim(
-    row: NDArray[np.int32], n_agents: int, n_landmarks: int, landmark: int, step: int
-) -> None:
-    """Mark a landmark as visited for good (R5), and note what R8 needs of the agent that claims it.
+def _claim(state: State, landmark: int) -> None:
+    """Mark a landmark as visited for good, and note what R8 needs of the agent that claims it.
 
     That is the agent of the lowest index on it.
     """
-    visited = n_agents + n_landmarks
-    moved = visited + n_landmarks + 1
-    claim_cell = moved + n_agents
-    claim_moved = claim_cell + n_agents
-    claim_step = claim_moved + n_agents
-    cell = row[n_agents + landmark]
+    cell = state.landmarks[landmark]
     agent = 0
-    while row[agent] != cell:
+    while state.cells[agent] != cell:
         agent += 1
-    row[visited + landmark] = 1
-    row[claim_cell + agent] = cell
-    row[claim_moved + agent] = row[moved + agent]
-    row[claim_step + agent] = step
+    state.visited[landmark] = 1
+    state.claim_cells[agent] = cell
+    state.claim_moved[agent] = state.moved[agent]
+    state.claim_steps[agent] = state.step[0]
 
 
 @kernel
-def landmark_source(row: NDArray[np.int32], n_agents: int, landmark: int, first_field: int) -> int:
-    """Return the line of ``distances`` with the steps from a landmark."""
-    if first_field == ALL_PAIRS:
-        return int(row[n_agents + landmark])
-    return first_field + landmark
-
-
-@kernel
-def reset_row(
-    row: NDArray[np.int32],
-    landmarks: NDArray[np.int32],
-    depot: int,
-    n_agents: int,
-    n_landmarks: int,
-) -> None:
-    """Start an episode (R2) on landmarks that satisfy its conditions, shape (K,)."""
-    row[:] = 0
-    for agent in range(n_agents):
-        row[agent] = depot
-    for landmark in range(n_landmarks):
-        row[n_agents + landmark] = landmarks[landmark]
-
-
-@kernel
-def measure_row(
-    row: NDArray[np.int32], n_agents: int, n_landmarks: int, table: NDArray[np.int32]
-) -> tuple[float, float, float]:
+def measure_row(row: NDArray[np.int32], world: World) -> tuple[float, float, float]:
     """Return cover time, makespan and total distance (R8), inf if a landmark is left.
 
     An agent's route is cut at its last claim and closed by a shortest path home; without a claim
     it is empty.
     """
-    visited = n_agents + n_landmarks
-    clock = visited + n_landmarks
-    claim_cell = clock + 1 + n_agents
-    claim_moved = claim_cell + n_agents
-    claim_step = claim_moved + n_agents
-    for landmark in range(n_landmarks):
-        if row[visited + landmark] == 0:
+    state = split_row(row, world.n_agents, world.n_landmarks)
+    for landmark in range(world.n_landmarks):
+        if state.visited[landmark] == 0:
             return np.inf, np.inf, np.inf
     makespan = 0
     distance = 0
-    for agent in range(n_agents):
-        step = row[claim_step + agent]
+    for agent in range(world.n_agents):
+        step = state.claim_steps[agent]
         if step > 0:
-            home = table[row[claim_cell + agent], HOME]
+            home = world.table[state.claim_cells[agent], HOME]
             makespan = max(makespan, step + home)
-            distance += row[claim_moved + agent] + home
-    return float(row[clock]), float(makespan), float(distance)
+            distance += state.claim_moved[agent] + home
+    return float(state.step[0]), float(makespan), float(distance)

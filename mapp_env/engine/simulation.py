@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mapp_env.engine.loops import step_and_observe
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.scene import Scene
+from mapp_env.engine.sources import draw_problems
 from mapp_env.engine.task import Task
 from mapp_env.problem import Problem
 
@@ -40,23 +41,19 @@ class Simulation:
         self.task = task
         self.max_cycles = task.max_cycles
         self.running = False
-        rows = Rows(task, 1, n_views)
-        self._rows = rows
+        self._rows = Rows(task, 1, n_views)
         self._limit = task.max_cycles
-        self._bind()
-        self._views_shape = rows.views_shape
-        self._masks_shape = rows.masks_shape
+        self._views_shape, self._masks_shape = self._rows.views_shape, self._rows.masks_shape
         self._shape = (n_views, *task.view.shape)
         self._records = task.render_mode is not None
+        self._bind()
 
     def _bind(self) -> None:
-        """Gather what the kernel of a step takes; looking it up would take longer than the step."""
-        rows = self._rows
-        self._row = rows.state[0]
-        self._rules = (*rows.sizes, rows.reward, rows.kind, *rows.tables)
+        """Gather what a step reads: to look it up would take longer than the step."""
+        self._row, self._world = self._rows.array[0], self._rows.world
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a copy; the row must be a view of the copied state, not a copy of the view."""
+        """Restore a copy; the row must be a view of the copied rows, not a copy of the view."""
         self.__dict__.update(state)
         self._bind()
 
@@ -64,13 +61,13 @@ class Simulation:
         """Start an episode on ``problem``, or on one drawn with a single word of ``np_random``."""
         self._limit = self.max_cycles
         if problem is None:
-            words = np_random.integers(2**64, size=1, dtype=np.uint64)
-            self._rows.start(FIRST_ROW, words, limit=self._limit)
+            word = np_random.integers(2**64, size=1, dtype=np.uint64)
+            landmarks = draw_problems(self.task, word)
         else:
             if problem.max_cycles is not None:
                 self._limit = problem.max_cycles
             landmarks = np.array([problem.landmarks], np.int32)
-            self._rows.start(FIRST_ROW, None, landmarks, self._limit)
+        self._rows.start(FIRST_ROW, landmarks, self._limit)
         self.running = True
 
     def step(
@@ -98,7 +95,7 @@ class Simulation:
         views = np.empty(self._views_shape, np.float32)
         masks = np.empty(self._masks_shape, np.int8)
         reward, terminated, truncated = step_and_observe(
-            self._row, actions, self._limit, *self._rules, views, masks
+            self._row, actions, self._limit, views, masks, self._world
         )
         if terminated or truncated:
             self.running = False
@@ -115,7 +112,7 @@ class Simulation:
 
     def state(self) -> NDArray[np.float32]:
         """Return the global observation (R9), shape (N + 2K,)."""
-        state: NDArray[np.float32] = self._row[: self.task.state_length].astype(np.float32)
+        state: NDArray[np.float32] = self._rows.state.head[0].astype(np.float32)
         return state
 
     def metrics(self) -> dict[str, bool | float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -10,38 +9,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.engine.observation import Observation, View, view
-from mapp_env.engine.rules import (
-    ALL_PAIRS,
-    BY_COORDINATES,
-    MAX_TABLE_CELLS,
-    N_ACTIONS,
-    NO_DISTANCES,
-    Reward,
-    cell_table,
-    manhattan_table,
-)
+from mapp_env.engine.observation import Observation, View, view, view_distances
+from mapp_env.engine.rules import Reward, reward_distances
+from mapp_env.engine.state import N_ACTIONS, NO_DISTANCES, World, cell_table
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.problem import (
     MAX_AGENTS,
     MAX_CYCLES,
     MAX_LANDMARKS,
-    Problem,
     check_grid,
-    check_landmarks,
 )
-from mapp_env.validation import check_choice, check_count, check_flag, describe
+from mapp_env.validation import check_choice, check_count, check_flag
 
-__all__ = ["RENDER_MODES", "Task"]
+__all__ = ["RENDER_MODES", "Task", "make_world"]
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
 
 MAX_BYTES = 1 << 30
 """Largest array of one kind (observations, distance fields) that an environment may need."""
-
-
-Distances = tuple[NDArray[np.int32], int]
-"""What the kernels take for ``distances``, shape (S, C), and ``first_field``."""
 
 
 @dataclass(frozen=True)
@@ -120,11 +105,6 @@ class Task:
         return N_ACTIONS + self.allow_wait
 
     @property
-    def state_length(self) -> int:
-        """Number of entries of the global observation, N + 2K (R9)."""
-        return self.n_agents + 2 * self.n_landmarks
-
-    @property
     def reward_kind(self) -> Reward:
         """The reward as the kernels know it."""
         return Reward[self.reward.upper()]
@@ -153,35 +133,22 @@ class Task:
         low, high = (np.repeat(bound[None], self.n_agents, axis=0) for bound in (one.low, one.high))
         return View((self.n_agents, *one.shape), low, high)
 
-    @cached_property
-    def table(self) -> NDArray[np.int32]:
-        """The grid as the kernels read it, shape (C, 9) int32."""
-        return cell_table(self.grid)
-
     @property
     def needs_fields(self) -> bool:
         """Whether paths are kept for each landmark, the grid being too large for all pairs."""
         wanted = "geodesic" in (self.reward, self.observation)
         return wanted and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
 
-    def reward_distances(self, lines: NDArray[np.int32]) -> Distances:
-        """Return the distances that the reward looks up."""
-        if self.reward == "geodesic":
-            return self._paths(lines)
-        if self.grid.n_cells <= MAX_TABLE_CELLS:
-            return manhattan_table(self.grid), ALL_PAIRS
-        return NO_DISTANCES, BY_COORDINATES
-
-    def view_distances(self, lines: NDArray[np.int32]) -> Distances:
-        """Return the distances that the observation looks up."""
-        return self._paths(lines) if self.observation == "geodesic" else (NO_DISTANCES, ALL_PAIRS)
-
-    def _paths(self, lines: NDArray[np.int32]) -> Distances:
-        if not self.needs_fields:
-            return self.grid.distances, ALL_PAIRS
-        seen = lines.view()
-        seen.flags.writeable = False
-        return seen, 0
+    def world(self, fields: NDArray[np.int32]) -> World:
+        """Return what the kernels look up; ``fields`` as in :func:`make_world`."""
+        return make_world(
+            self.grid,
+            self.n_agents,
+            self.n_landmarks,
+            self.reward_kind,
+            self.observation_kind,
+            fields,
+        )
 
     def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
         """Refuse a number of rows whose arrays would not fit in memory.
@@ -212,43 +179,44 @@ class Task:
                 f"on {self.grid!r} would take {size} bytes, allowed are {MAX_BYTES}"
             )
 
-    # -- what a reset may ask for ------------------------------------------------------
 
-    def check_options(self, options: Mapping[str, Any] | None) -> Problem | None:
-        """Return the problem that ``reset(options=...)`` asks for, or ``None`` for a random one.
+def make_world(
+    grid: Grid,
+    n_agents: int,
+    n_landmarks: int,
+    reward: Reward = Reward.STEP,
+    observation: Observation = Observation.GLOBAL,
+    fields: NDArray[np.int32] = NO_DISTANCES[:0],
+) -> World:
+    """Return what the rules look up on a grid; sizes are not checked here.
 
-        ``"landmarks"`` holds cells or (row, col) pairs, ``"problem"`` a whole problem on this grid
-        with as many agents and landmarks. Other keys are ignored.
+    Parameters
+    ----------
+    grid : Grid
+        The grid.
+    n_agents, n_landmarks : int
+        Agents N and landmarks K.
+    reward : Reward
+        The team reward.
+    observation : Observation
+        What is seen.
+    fields : ndarray of int32, shape (B * K, C), or empty
+        Where shortest paths from the rows' landmarks will stand; empty: those of all pairs do.
 
-        Raises
-        ------
-        ValueError
-            If the wish cannot be met.
-        """
-        if options is None:
-            return None
-        if not isinstance(options, Mapping):
-            raise ValueError(f"options must be a dict or None, got {describe(options)}")
-        problem, landmarks = options.get("problem"), options.get("landmarks")
-        if problem is None and landmarks is None:
-            return None
-        if problem is None:
-            cells = check_landmarks(self.grid, landmarks, self.n_landmarks, "options['landmarks']")
-            return Problem(self.grid, cells, self.n_agents)
-        if landmarks is not None:
-            raise ValueError("options must hold 'problem' or 'landmarks', got both")
-        if not isinstance(problem, Problem):
-            raise ValueError(
-                f"options['problem'] must be a mapp_env.Problem, got {describe(problem)}"
-            )
-        wanted = (problem.grid, problem.n_agents, len(problem.landmarks))
-        if wanted != (self.grid, self.n_agents, self.n_landmarks):
-            raise ValueError(
-                f"options['problem'] must be on this environment's {self.grid!r} with "
-                f"{self.n_agents} agents and {self.n_landmarks} landmarks; got one on "
-                f"{problem.grid!r} with {problem.n_agents} and {len(problem.landmarks)}"
-            )
-        return problem
+    Raises
+    ------
+    ValueError
+        If shortest paths are looked up, without fields, on a grid too large for all pairs.
+    """
+    return World(
+        n_agents,
+        n_landmarks,
+        int(reward),
+        int(observation),
+        cell_table(grid),
+        *reward_distances(reward, grid, fields),
+        *view_distances(observation, grid, fields),
+    )
 
 
 def _names(kinds: type[Reward] | type[Observation]) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from mapp_env.engine.simulation import Simulation
+from mapp_env.engine.sources import check_options
 from mapp_env.engine.task import RENDER_MODES, Task
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
@@ -55,7 +56,7 @@ class SimulationEnv(gymnasium.Env[Any, Any]):
         """Start an episode; return views, shape (V, ...), and action masks, shape (N, A)."""
         if seed is not None:
             seed = check_count("seed", seed, 0, MAX_SEED)
-        problem = self.task.check_options(options)
+        problem = check_options(self.task, options)
         super().reset(seed=seed)
         self._simulation.reset(problem, self.np_random)
         self._started = True

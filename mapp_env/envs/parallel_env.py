@@ -15,6 +15,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from mapp_env.engine.simulation import Simulation
+from mapp_env.engine.sources import check_options
 from mapp_env.engine.task import RENDER_MODES, Task
 from mapp_env.grid import Grid
 from mapp_env.grids import find_grid
@@ -166,7 +167,7 @@ class MappParallelEnv(pettingzoo.ParallelEnv[AgentID, NDArray[np.float32], int])
         """
         if seed is not None:
             seed = check_count("seed", seed, 0, MAX_SEED)
-        problem = self.task.check_options(options)
+        problem = check_options(self.task, options)
         if seed is not None:
             self._np_random, _ = seeding.np_random(seed)
         self._simulation.reset(problem, self.np_random)

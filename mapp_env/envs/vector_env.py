@@ -18,9 +18,9 @@ from mapp_env.engine.loops import find_bad_action
 from mapp_env.engine.observation import Observation
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
+from mapp_env.engine.sources import check_problems, check_reset_mask, draw_problems
 from mapp_env.engine.task import Task
 from mapp_env.envs.central_env import CentralEnv, central_action_space
-from mapp_env.envs.reset_options import check_problems, check_reset_mask
 from mapp_env.envs.vector_infos import Transition, add_joint_masks, make_infos
 from mapp_env.grid import Grid
 from mapp_env.grids import find_grid
@@ -194,13 +194,13 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         mask = check_reset_mask(options, self.num_envs)
         if not self._started and not mask.all():
             raise ValueError("options['reset_mask'] must be all True in the first reset")
-        landmarks, limit = check_problems(options, self.task, self.num_envs)
+        landmarks, limit = check_problems(self.task, options, self.num_envs)
         indices = np.flatnonzero(mask)
         self._seeds.seed(seeds, indices.tolist())
         if landmarks is None:
-            self._rows.start(indices, self._seeds.next_words(indices))
+            self._draw(indices)
         else:
-            self._rows.start(indices, None, landmarks[indices], limit)
+            self._rows.start(indices, landmarks[indices], limit)
         self._ended[indices] = False
         self._started = True
         views, action_mask = self._rows.observe()
@@ -277,7 +277,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             skip = self._ended
             starting = np.flatnonzero(skip)
             if len(starting):
-                self._rows.start(starting, self._seeds.next_words(starting))
+                self._draw(starting)
         rewards, terminations, truncations, views, masks = self._rows.step(joint_actions, skip)
         observations = views.reshape(self._observations_shape)
         self._ended = terminations | truncations
@@ -289,7 +289,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if len(ended):
             endings = self._rows.measure(ended), observations[ended], masks[ended]
             if restarted:
-                self._rows.start(ended, self._seeds.next_words(ended))
+                self._draw(ended)
                 views[ended], masks[ended] = self._rows.observe(ended)
         return Transition(
             observations,
@@ -302,6 +302,10 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             *endings,
             restarted,
         )
+
+    def _draw(self, indices: NDArray[np.int64]) -> None:
+        """Start an episode on a random problem in some rows."""
+        self._rows.start(indices, draw_problems(self.task, self._seeds.next_words(indices)))
 
     # -- checks ------------------------------------------------------------------------
 

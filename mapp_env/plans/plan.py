@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapp_env.engine.rules import WAIT
+from mapp_env.engine.state import WAIT
 from mapp_env.files import (
     MAX_INTEGER,
     MAX_PLAN_BYTES,

@@ -9,17 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.engine.rules import (
-    BY_COORDINATES,
-    NO_DISTANCES,
-    WAIT,
-    Reward,
-    cell_table,
-    measure_row,
-    reset_row,
-    row_length,
-    step_row,
-)
+from mapp_env.engine.rules import measure_row, reset_row, step_row
+from mapp_env.engine.state import WAIT, Packed, World, new_rows, split_row
+from mapp_env.engine.task import make_world
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
@@ -51,15 +43,12 @@ def play(problem: Problem, actions: NDArray[np.int64]) -> Played:
     """
     actions = actions[: problem.max_cycles]
     n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
-    table = cell_table(problem.grid)
-    row = np.empty(row_length(n_agents, n_landmarks), np.int32)
-    landmarks = np.array(problem.landmarks, np.int32)
-    reset_row(row, landmarks, problem.grid.depot, n_agents, n_landmarks)
+    world = make_world(problem.grid, n_agents, n_landmarks)
+    row = new_rows(1, n_agents, n_landmarks)[0]
+    reset_row(row, np.array(problem.landmarks, np.int32), problem.grid.depot, world)
     cells = np.full((len(actions) + 1, n_agents), problem.grid.depot, np.int32)
     visits = np.zeros(n_landmarks, np.int64)
-    steps = play_row(
-        row, actions, n_agents, n_landmarks, table, NO_DISTANCES, len(actions), cells, visits
-    )
+    steps = play_row(row, actions, cells, visits, tuple(world))
     claims: list[list[int]] = [[] for _ in range(n_agents)]
     claim_steps: list[list[int]] = [[] for _ in range(n_agents)]
     for landmark in np.argsort(visits, kind="stable"):
@@ -68,7 +57,7 @@ def play(problem: Problem, actions: NDArray[np.int64]) -> Played:
             agent = int(np.argmax(cells[step] == cell))
             claims[agent].append(cell)
             claim_steps[agent].append(step)
-    costs = measure_row(row, n_agents, n_landmarks, table)
+    costs = measure_row(row, world)
     return Played(
         tuple(
             _tour(problem.grid, cells[:, agent], steps_of)
@@ -94,42 +83,33 @@ def _tour(grid: Grid, cells: NDArray[np.int32], claim_steps: list[int]) -> tuple
 def play_row(
     row: NDArray[np.int32],
     actions: NDArray[np.int64],
-    n_agents: int,
-    n_landmarks: int,
-    table: NDArray[np.int32],
-    distances: NDArray[np.int32],
-    max_cycles: int,
     cells: NDArray[np.int32],
     visits: NDArray[np.int64],
+    world: Packed,
 ) -> int:
     """Step a row through joint actions, and return how many were carried out.
 
     Parameters
     ----------
-    row, actions, n_agents, n_landmarks, table, distances, max_cycles
-        As in :func:`~mapp_env.engine.rules.step_row`, but for all steps: actions are (T, N).
+    row : ndarray of int32
+        At reset; changed in place.
+    actions : ndarray of int64, shape (T, N)
+        The joint actions.
     cells : ndarray of int32, shape (T + 1, N)
         Where the agents are after each step.
     visits : ndarray of int64, shape (K,)
         Zero on entry; the step at which each landmark is visited.
+    world : tuple
+        What is looked up.
     """
-    visited = n_agents + n_landmarks
+    own = World(*world)
+    state = split_row(row, own.n_agents, own.n_landmarks)
     for step in range(1, actions.shape[0] + 1):
-        _, terminated, _ = step_row(
-            row,
-            actions[step - 1],
-            n_agents,
-            n_landmarks,
-            max_cycles,
-            Reward.STEP,
-            table,
-            distances,
-            BY_COORDINATES,
-        )
-        for agent in range(n_agents):
-            cells[step, agent] = row[agent]
-        for landmark in range(n_landmarks):
-            if row[visited + landmark] == 1 and visits[landmark] == 0:
+        _, terminated, _ = step_row(row, actions[step - 1], actions.shape[0], own)
+        for agent in range(own.n_agents):
+            cells[step, agent] = state.cells[agent]
+        for landmark in range(own.n_landmarks):
+            if state.visited[landmark] == 1 and visits[landmark] == 0:
                 visits[landmark] = step
         if terminated:
             return step

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.engine.rules import WAIT
+from mapp_env.engine.state import WAIT
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
 

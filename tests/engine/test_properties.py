@@ -20,6 +20,9 @@ from model import PAPER_ROWS, REWARDS, landmark_cells, symmetries, transform
 
 import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.rules import Reward
+from mapp_env.engine.task import make_world
 
 KINDS = ("global", "own_first", "planes", "geodesic")
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -104,6 +107,23 @@ def test_eight_symmetries_change_nothing(game: dict[str, Any]) -> None:
             cells = [turned.cell[int(cell)] for cell in original[:n_agents]]
             assert state[:n_agents] == cells
     assert len(seen) == 8
+
+
+@given(games())
+def test_moves_made_elsewhere_meet_the_same_rules(game: dict[str, Any]) -> None:
+    """`visit_rows`, told where agents stand after each move, gives what the environment gives."""
+    n_agents, n_landmarks = len(game["actions"][0]), len(game["landmarks"])
+    steps = play(**game)
+    states = np.array([state for state, *_ in steps], int)
+    cells, landmarks, visited = np.split(states, [n_agents, n_agents + n_landmarks], axis=1)
+    before = np.vstack((np.zeros_like(visited[:1]), visited[:-1])).astype(bool)
+    grid = mapp_env.Grid.from_text("\n".join(game["rows"]) + "\n")
+    world = make_world(grid, n_agents, n_landmarks, Reward[game["reward"].upper()])
+    after, rewards, terminated = visit_rows(world, cells, landmarks, before)
+    assert after.dtype == np.bool_
+    assert np.array_equal(after, visited)
+    assert rewards.tolist() == [reward for _, reward, *_ in steps]
+    assert terminated.tolist() == [ended for _, _, ended, *_ in steps]
 
 
 @given(games(), st.permutations(range(3)), st.randoms(use_true_random=False))

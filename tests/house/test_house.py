@@ -112,7 +112,7 @@ def test_the_reader_reads() -> None:
     assert own("mapp_env.mapp_v0") == "mapp_env.mapp_v0"
     assert own("mapp_env.Grid") == "mapp_env"
     assert own("numpy.typing") is None
-    assert any(own(name) == "mapp_env.engine.rules" for name, _ in imports(observation))
+    assert any(own(name) == "mapp_env.engine.state" for name, _ in imports(observation))
     assert {room(module_name(path)) for path in (*FILES, *BASELINES)} == set(LAYERS)
     assert room("baselines.meta_dqn") == "baselines"
 

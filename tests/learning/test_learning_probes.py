@@ -20,7 +20,9 @@ from baselines.meta_dqn import (
 )
 from baselines.networks import network_spec
 from mapp_env import Grid
-from mapp_env.engine.rules import BY_COORDINATES, NO_DISTANCES, Reward, cell_table, step_row
+from mapp_env.engine.rules import step_row
+from mapp_env.engine.state import new_rows, split
+from mapp_env.engine.task import make_world
 
 LEFT, RIGHT, UP, DOWN = range(4)
 SQUARE = Grid.from_text("D..\n...\n...")
@@ -288,7 +290,8 @@ def optimal_values(
     grid: Grid, n_agents: int, landmarks: Sequence[int], discount: float
 ) -> dict[tuple[int, ...], np.ndarray]:
     """Return the values of all joint actions in all states of -1 a step, by the step kernel."""
-    table, n_landmarks = cell_table(grid), len(landmarks)
+    n_landmarks = len(landmarks)
+    world = make_world(grid, n_agents, n_landmarks)
     outcomes = {}
     for cells in product([grid.depot, *grid.reachable.tolist()], repeat=n_agents):
         for flags in product((0, 1), repeat=n_landmarks):
@@ -296,13 +299,11 @@ def optimal_values(
             if all(flags) or any(there and not flag for there, flag in zip(on, flags, strict=True)):
                 continue
             for actions in product(range(4), repeat=n_agents):
-                row = np.zeros(5 * n_agents + 2 * n_landmarks + 1, np.int32)
-                row[: n_agents + 2 * n_landmarks] = [*cells, *landmarks, *flags]
-                reward, terminated, _ = step_row(
-                    row, np.array(actions), n_agents, n_landmarks, 10**6, int(Reward.STEP), table,
-                    NO_DISTANCES, BY_COORDINATES,
-                )  # fmt: skip
-                following = tuple(row[: n_agents + 2 * n_landmarks].tolist())
+                row = new_rows(1, n_agents, n_landmarks)[0]
+                head = split(row, n_agents, n_landmarks).head
+                head[:] = [*cells, *landmarks, *flags]
+                reward, terminated, _ = step_row(row, np.array(actions), 10**6, world)
+                following = tuple(head.tolist())
                 outcomes.setdefault((*cells, *landmarks, *flags), []).append(
                     (reward, None if terminated else following)
                 )

@@ -9,15 +9,9 @@ from baselines.networks import network_spec, split_joint
 from baselines.replay.imagined import UNKNOWN, ImaginedReplay, relabelled_reward, try_actions
 from baselines.replay.own_imagined import OwnImaginedReplay
 from mapp_env import Grid, make_grid
-from mapp_env.engine.rules import (
-    ALL_PAIRS,
-    BY_COORDINATES,
-    NO_DISTANCES,
-    Reward,
-    cell_table,
-    row_length,
-    step_row,
-)
+from mapp_env.engine.rules import Reward, step_row
+from mapp_env.engine.state import new_rows, split
+from mapp_env.engine.task import make_world
 
 GRIDS = {
     "paper": make_grid("paper-7x7"),
@@ -25,7 +19,6 @@ GRIDS = {
     "rooms": Grid.from_text("....#...\n..#....#\n.#..D.#.\n...##...\n.#......"),
     "hall": Grid.from_text("......\n......\n...D..\n......"),
 }
-TABLES = {grid: cell_table(grid) for grid in GRIDS.values()}
 REWARDS = ("manhattan", "geodesic", "step")
 
 
@@ -62,17 +55,12 @@ def step_by_the_rules(
 ) -> tuple[np.ndarray, float, bool]:
     """Return the next observation, the reward and whether it ends, from the env's own kernel."""
     n_landmarks = (len(observation) - n_agents) // 2
-    row = np.zeros(row_length(n_agents, n_landmarks), np.int32)
-    row[: len(observation)] = observation
-    distances, first = NO_DISTANCES, BY_COORDINATES
-    if kind == "geodesic":
-        distances, first = np.array(grid.distances, np.int32), ALL_PAIRS
-        distances.flags.writeable = False
-    reward, terminated, _ = step_row(
-        row, np.array(actions), n_agents, n_landmarks, 10**6, int(Reward[kind.upper()]),
-        TABLES[grid], distances, first,
-    )  # fmt: skip
-    return row[: len(observation)].astype(np.float32), reward, terminated
+    row = new_rows(1, n_agents, n_landmarks)[0]
+    head = split(row, n_agents, n_landmarks).head
+    head[:] = observation
+    world = make_world(grid, n_agents, n_landmarks, Reward[kind.upper()])
+    reward, terminated, _ = step_row(row, np.array(actions), 10**6, world)
+    return head.astype(np.float32), reward, terminated
 
 
 def round_of(replay, reward, rng):

@@ -19,15 +19,9 @@ import pytest
 
 import mapp_env
 from mapp_env import Grid, Problem, mapp_v0, replay, solve
-from mapp_env.engine.rules import (
-    BY_COORDINATES,
-    Reward,
-    cell_table,
-    measure_row,
-    reset_row,
-    row_length,
-    step_row,
-)
+from mapp_env.engine.rules import measure_row, reset_row, step_row
+from mapp_env.engine.state import State, World, new_rows, split
+from mapp_env.engine.task import make_world
 from mapp_env.solvers import partition, solve_universe
 from mapp_env.solvers.batch import least_worst
 from mapp_env.solvers.bounds import lower_bound, tree_bound
@@ -142,12 +136,13 @@ def test_exact_is_brute_force_on_larger_problems(landmarks: int, agents: int) ->
             assert (plan.cost, plan.total_distance) == (cost, total)
 
 
-def rows_after(problem: Problem) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Return a row of the rules at reset, the grid's table and the numbers (N, K)."""
+def row_at_reset(problem: Problem) -> tuple[np.ndarray, World]:
+    """Return a row of the rules at reset, and its world."""
     sizes = (problem.n_agents, len(problem.landmarks))
-    row = np.zeros(row_length(*sizes), np.int32)
-    reset_row(row, np.array(problem.landmarks, np.int32), problem.grid.depot, *sizes)
-    return row, cell_table(problem.grid), sizes
+    world = make_world(problem.grid, *sizes)
+    row = new_rows(1, *sizes)[0]
+    reset_row(row, np.array(problem.landmarks, np.int32), problem.grid.depot, world)
+    return row, world
 
 
 def search_states(problem: Problem, objective: str, limit: int) -> float:
@@ -157,25 +152,28 @@ def search_states(problem: Problem, objective: str, limit: int) -> float:
     flags and, for the costs with a way home, what each agent would have paid so far. Costs above
     ``limit`` are not told apart.
     """
-    start, table, (n_agents, n_landmarks) = rows_after(problem)
+    start, world = row_at_reset(problem)
     home = problem.grid.home
-    no_distances = np.zeros((1, 1), np.int32)
-    joint_actions = np.array(list(itertools.product(range(5), repeat=n_agents)), np.int64)
-    clock = n_agents + 2 * n_landmarks
-    moved = slice(clock + 1, clock + 1 + n_agents)
-    at, far, when = (
-        slice(moved.stop + k * n_agents, moved.stop + (k + 1) * n_agents) for k in range(3)
-    )
+    joint_actions = np.array(list(itertools.product(range(5), repeat=problem.n_agents)), np.int64)
+
+    def parts_of(row: np.ndarray) -> State:
+        return split(row, problem.n_agents, len(problem.landmarks))
 
     def key(row: np.ndarray) -> tuple[bytes, ...]:
-        state = (row[:n_agents].tobytes(), row[n_agents + n_landmarks : clock].tobytes())
-        claimed = row[when] > 0
+        state = parts_of(row)
+        met = (state.cells.tobytes(), state.visited.tobytes())
+        claimed = state.claim_steps > 0
         if objective == "makespan":
-            return (*state, np.where(claimed, row[when] + home[row[at]], 0).tobytes())
+            back = state.claim_steps + home[state.claim_cells]
+            return (*met, np.where(claimed, back, 0).tobytes())
         if objective == "total_distance":
-            paid = np.where(claimed, row[far] + home[row[at]], 0)
-            return (*state, paid.tobytes(), np.minimum(row[moved], limit + 1).tobytes())
-        return state
+            moved = np.minimum(state.moved, limit + 1)
+            return (*met, paid_by(state).tobytes(), moved.tobytes())
+        return met
+
+    def paid_by(state: State) -> np.ndarray:
+        claimed = state.claim_steps > 0
+        return np.where(claimed, state.claim_moved + home[state.claim_cells], 0)
 
     best = math.inf
     seen = {key(start)}
@@ -185,18 +183,14 @@ def search_states(problem: Problem, objective: str, limit: int) -> float:
         for before in layer:
             for actions in joint_actions:
                 row = before.copy()
-                _, terminated, _ = step_row(
-                    row, actions, n_agents, n_landmarks, 10**6, int(Reward.STEP), table,
-                    no_distances, BY_COORDINATES,
-                )  # fmt: skip
+                _, terminated, _ = step_row(row, actions, 10**6, world)
                 if terminated:
-                    costs = measure_row(row, n_agents, n_landmarks, table)
+                    costs = measure_row(row, world)
                     best = min(best, costs[OBJECTIVES.index(objective)])
                     continue
-                paid = np.where(row[when] > 0, row[far] + home[row[at]], 0)
-                if objective == "total_distance" and paid.sum() > limit:
+                if objective == "total_distance" and paid_by(parts_of(row)).sum() > limit:
                     continue
-                if objective == "makespan" and row[clock] > limit:
+                if objective == "makespan" and parts_of(row).step[0] > limit:
                     continue
                 state = key(row)
                 if state not in seen:
