@@ -108,27 +108,8 @@ def main(args: Args) -> None:
             args.out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ValueError(f"out: cannot write into {args.out}: {error}") from error
-    rng_policy, rng_guidance = np.random.default_rng(args.seed).spawn(2)
-    seen: list[tuple[int, ...]] = []
-    label = args.policy
-    policy: Acting
-    if args.policy in RIVALS:
-        values = {name: getattr(args, name) for name in SETTING[1:]}
-        said = {name: value for name, value in values.items() if value is not None}
-        setting = Setting(find_grid("paper-7x7" if args.grid is None else args.grid), **said)
-        if args.policy == "random":
-            policy = RandomPolicy(setting.n_agents, N_ACTIONS, rng_policy)
-        else:
-            label, rule = RULES[args.policy]
-            policy = rule(setting.grid, setting.n_agents, setting.n_landmarks)
-    else:
-        policy, setting, seen = load_run(args.policy, args.device)
-    if args.guidance > 0:
-        reach = 3 if args.guidance_reach is None else args.guidance_reach
-        guidance = Guidance(setting.grid, setting.n_agents, setting.n_landmarks, reach)
-        policy = GuidedPolicy(policy, guidance, args.guidance, rng_guidance)
-        label += f" + guidance {args.guidance:g}"
-    problems = choose_problems(args, setting, seen)
+    label, policy, setting, training_problems = choose_policy(args)
+    problems = choose_problems(args, setting, training_problems)
     optima = find_optima(setting, problems)
     table = {
         name: evaluate(acting, setting, problems, optima, progress=name)
@@ -141,38 +122,64 @@ def main(args: Args) -> None:
         save_table(args.out, table)
 
 
-def choose_problems(args: Args, setting: Setting, seen: list[tuple[int, ...]]) -> np.ndarray:
+def choose_policy(args: Args) -> tuple[str, Acting, Setting, list[tuple[int, ...]]]:
+    """Return what the table calls the policy, the policy, its task and its training problems."""
+    rng_policy, rng_guidance = np.random.default_rng(args.seed).spawn(2)
+    label, training_problems = args.policy, []
+    policy: Acting
+    if args.policy in RIVALS:
+        values = {name: getattr(args, name) for name in SETTING[1:]}
+        given = {name: value for name, value in values.items() if value is not None}
+        setting = Setting(find_grid("paper-7x7" if args.grid is None else args.grid), **given)
+        if args.policy == "random":
+            policy = RandomPolicy(setting.n_agents, N_ACTIONS, rng_policy)
+        else:
+            label, rule = RULES[args.policy]
+            policy = rule(setting.grid, setting.n_agents, setting.n_landmarks)
+    else:
+        policy, setting, training_problems = load_run(args.policy, args.device)
+    if args.guidance > 0:
+        reach = 3 if args.guidance_reach is None else args.guidance_reach
+        guidance = Guidance(setting.grid, setting.n_agents, setting.n_landmarks, reach)
+        policy = GuidedPolicy(policy, guidance, args.guidance, rng_guidance)
+        label += f" + guidance {args.guidance:g}"
+    return label, policy, setting, training_problems
+
+
+def choose_problems(
+    args: Args, setting: Setting, training_problems: list[tuple[int, ...]]
+) -> np.ndarray:
     """Return the problems to play, (P, K), and say where they are not what was asked for."""
+    total = count_problems(setting)
     if args.problems == "universe":
-        if seen:
+        if training_problems:
             print(
-                f"all {count_problems(setting):,} problems of the grid, the {len(seen)} that the "
-                "run was trained on among them\n"
+                f"all {total:,} problems of the grid, the {len(training_problems)} that the run "
+                "was trained on among them\n"
             )
         return every_problem(setting)
-    if count_problems(setting) == 0:
+    if total == 0:
         raise ValueError(
             f"n_landmarks must be at most {setting.grid.reachable.size}, the cells of this grid "
             f"that may hold one; got {setting.n_landmarks}"
         )
-    n_problems = count_unseen(setting, seen)
+    n_problems = count_unseen(setting, training_problems)
     if n_problems < 1:
         raise ValueError("problems: there is none that the run was not trained on")
     if n_problems < args.problems:
         print(f"only {n_problems:,} of {args.problems:,} problems: there are no more unseen ones\n")
-    return unseen_problems(setting, min(args.problems, n_problems), seen, args.seed)
+    return unseen_problems(setting, min(args.problems, n_problems), training_problems, args.seed)
 
 
 def worst_cases(evaluation: Evaluation) -> list[str]:
     """Return lines on problems that nobody solves, that this one does not, and the largest gap."""
-    lines = out_of_reach(evaluation.setting, evaluation.optima)
-    if evaluation.optima is None:
+    optima, unsolved = evaluation.optima, ~evaluation.success
+    lines = out_of_reach(evaluation.setting, optima)
+    if optima is None:
         lines.append(f"no gaps: optima are proven up to {MAX_EXACT_LANDMARKS} landmarks")
-    unsolved = ~evaluation.success
     if unsolved.any():
         cells = " ".join(map(str, evaluation.landmarks[unsolved.argmax()]))
         lines.append(f"unsolved: {unsolved.sum():,}, the first with landmarks {cells}")
-    optima = evaluation.optima
     if optima is not None and not unsolved.all():
         index = int(np.where(unsolved, -1.0, evaluation.gaps).argmax())
         lines.append(

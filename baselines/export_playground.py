@@ -28,9 +28,10 @@ import tyro
 from baselines.networks import NetworkSpec
 from baselines.policies.evaluation import evaluate, every_problem
 from baselines.policies.policy import find_weights, load_policy
-from baselines.policies.settings import Setting, load_run
+from baselines.policies.settings import PolicyOfRun, Setting, load_run
 from mapp_env import Grid, make_grid
 from mapp_env.files import write_bytes
+from mapp_env.grid import tell_apart
 
 PLAYGROUND = Path(__file__).resolve().parents[1] / "docs" / "playground"
 COMMAND = "python baselines/export_playground.py"
@@ -62,13 +63,12 @@ def export(policy: str) -> str:
         If there is no such policy, or the page cannot run it: it is of another setting or kind,
         or has weights that 16 bits have no room for.
     """
-    trained, setting, _ = load_run(policy)
-    check_setting(policy, setting)
-    check_network(policy, trained.spec)
-    file = find_weights(policy)
-    rows = kept_rows(trained.spec, setting.grid)
+    run = load_run(policy)
+    check_runs(policy, run)
+    file, (network, setting) = find_weights(policy), (run.policy.network, run.setting)
+    rows = kept_rows(network.spec, setting.grid)
     tensors = {}
-    for name, tensor in sorted(trained.network.state_dict().items()):
+    for name, tensor in sorted(network.state_dict().items()):
         if tensor.abs().max() > torch.finfo(torch.float16).max:
             raise ValueError(f"policy {policy!r}: {name} holds more than 16 bits have room for")
         values = tensor.numpy()
@@ -81,7 +81,7 @@ def export(policy: str) -> str:
         "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
         "grid": setting.grid.to_text(),
         "max_cycles": setting.max_cycles,
-        "spec": trained.spec.as_dict(),
+        "spec": network.spec.as_dict(),
         "tensors": tensors,
     }
     fields = ",\n".join(f"{json.dumps(name)}: {_lines(about[name])}" for name in about)
@@ -99,33 +99,27 @@ def _lines(value: object) -> str:
     return f"{{\n{entries}\n}}"
 
 
-def check_setting(policy: str, setting: Setting) -> None:
-    """Refuse a policy that was trained for something else than the page shows.
+def check_runs(policy: str, run: PolicyOfRun) -> None:
+    """Refuse a policy of another task than the page shows, or a network that it has no code for.
 
     Raises
     ------
     ValueError
-        If grid, number of agents, landmarks or step limit differ from the default setting's.
+        If grid, number of agents, landmarks or step limit differ from the default setting's; or
+        if it is not one network of kind "pairs" for all agents, with joint outputs.
     """
     shown = Setting(make_grid())
-    if setting.grid != shown.grid:
-        raise ValueError(f"policy {policy!r} is of another grid than the page's, paper-7x7")
+    if run.setting.grid != shown.grid:
+        raise ValueError(
+            f"policy {policy!r} is of another grid than the page's, paper-7x7: "
+            f"{tell_apart(shown.grid, run.setting.grid)}"
+        )
     for name in ("n_agents", "n_landmarks", "max_cycles"):
-        found, wanted = getattr(setting, name), getattr(shown, name)
+        found, wanted = getattr(run.setting, name), getattr(shown, name)
         if found != wanted:
             raise ValueError(f"policy {policy!r} has {name}={found}, the page {wanted}")
-
-
-def check_network(policy: str, spec: NetworkSpec) -> None:
-    """Refuse a network that the page has no code for.
-
-    Raises
-    ------
-    ValueError
-        If it is not one network of kind "pairs" for all agents, with joint outputs.
-    """
     for name, wanted in {"kind": "pairs", "outputs": "joint", "team": "one"}.items():
-        found = getattr(spec, name)
+        found = getattr(run.policy.spec, name)
         if found != wanted:
             raise ValueError(
                 f"policy {policy!r} has a network with {name}={found!r}, the page runs {wanted!r}"
@@ -137,7 +131,7 @@ def kept_rows(spec: NetworkSpec, grid: Grid) -> dict[str, np.ndarray]:
 
     Landmarks are free cells but the depot; agents stand on these or on the depot, and never on an
     unvisited landmark. The page lists the rows in the same way (``keptRows`` in network.js), and
-    :mod:`baselines.networks.lookups` numbers them.
+    :mod:`baselines.networks.pairs` numbers them.
     """
     c = spec.n_cells
     landmarks = grid.reachable.tolist()
@@ -172,8 +166,10 @@ def count_changed(policy: str) -> tuple[int, int, int]:
     problems = every_problem(setting)
     changed = other_steps = 0
     for landmarks in np.array_split(problems, -(-len(problems) // 65_536)):
-        one = evaluate(exact, setting, landmarks, n_kept=len(landmarks))
-        other = evaluate(rounded, setting, landmarks, n_kept=len(landmarks))
+        one, other = (
+            evaluate(policy, setting, landmarks, n_kept=len(landmarks))
+            for policy in (exact, rounded)
+        )
         steps = (one.steps != other.steps) | (one.success != other.success)
         # Actions after the end are kept as 0, whatever the policy.
         changed += int((steps | (one.actions != other.actions).any(axis=(0, 2))).sum())

@@ -44,7 +44,8 @@ from baselines.policies.evaluation import (
     unseen_problems,
 )
 from baselines.policies.policy import NetworkPolicy
-from baselines.policies.settings import N_ACTIONS, Setting, load_run
+from baselines.policies.rules_of_thumb import RandomPolicy
+from baselines.policies.settings import N_ACTIONS, PolicyOfRun, load_run
 from baselines.replay.imagined import UNKNOWN, join
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 from mapp_env.engine.loops import visit_rows
@@ -52,8 +53,8 @@ from mapp_env.engine.task import make_world
 from mapp_env.validation import check_count, check_number
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
-# at sharpnesses from one end to the other, episode by episode.
-SHARPNESS = (0.1, 16.0)
+# at inverse temperatures from one end to the other, episode by episode.
+INVERSE_TEMPERATURES = (0.1, 16.0)
 LEARNING = ("imagined", "updates_per_episode", "learning_rate", "patience")
 
 
@@ -101,9 +102,9 @@ class Args(solving.Args):
 
 
 class Episode(NamedTuple):
-    """What was seen and done until all landmarks were visited."""
+    """What was observed and done until all landmarks were visited."""
 
-    seen: np.ndarray  # (T, D) float32
+    observations: np.ndarray  # (T, N + 2K) float32
     joint: np.ndarray  # (T,) int64, joint actions
 
 
@@ -121,24 +122,35 @@ class Tuner:
     """
 
     def __init__(self, args: Args, network: Network, problem: Problem) -> None:
-        if network.spec.n_joint_actions > MAX_JOINT_ACTIONS:
+        spec = network.spec
+        if spec.n_joint_actions > MAX_JOINT_ACTIONS:
             raise ValueError(
                 f"policy must be of a team with at most {MAX_JOINT_ACTIONS:,} joint actions, got "
-                f"{network.spec.n_joint_actions:,}"
+                f"{spec.n_joint_actions:,}"
             )
         self.args, self.problem = args, problem
-        self.network = copy.deepcopy(network)
-        self.spec = network.spec
+        self.network, self.spec = copy.deepcopy(network), spec
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=args.learning_rate)
         self.rng = np.random.default_rng(args.seed)
         self.moves = np.full((problem.grid.n_cells, N_ACTIONS), UNKNOWN, np.int64)  # experienced
-        self.digits = split_joint(np.arange(self.spec.n_joint_actions), self.spec.n_agents, 4)
+        self.world = make_world(problem.grid, spec.n_agents, spec.n_landmarks)
+        self.digits = split_joint(np.arange(spec.n_joint_actions), spec.n_agents, N_ACTIONS)
         self.best: Episode | None = None
 
-    def remember(self, seen: np.ndarray, actions: np.ndarray, following: np.ndarray) -> None:
-        """Keep where each agent's move has led."""
+    def run_episode(self, env: mapp_v0.parallel_env, random: bool) -> Plan:
+        """Play an episode, greedily or at random, and keep where each agent's moves have led."""
         n = self.spec.n_agents
-        self.moves[seen[:n].astype(np.int64), actions] = following[:n]
+        policy = RandomPolicy(n, N_ACTIONS, self.rng) if random else NetworkPolicy(self.network)
+        leader = env.possible_agents[0]
+        obs = env.reset(options={"landmarks": list(self.problem.landmarks)})[0][leader]
+        taken = []
+        while env.agents:
+            actions = policy.act(obs[None])[0]
+            next_obs = env.step(dict(zip(env.agents, actions.tolist(), strict=True)))[0][leader]
+            self.moves[obs[:n].astype(np.int64), actions] = next_obs[:n]
+            obs = next_obs
+            taken.append(actions)
+        return replay(replace(self.problem, max_cycles=None), np.array(taken))
 
     def train(self) -> None:
         """Imagine episodes, and learn to do what was done in the shortest so far."""
@@ -147,9 +159,11 @@ class Tuner:
             self.best = found
         if self.best is None:
             return
-        seen, joint = map(torch.from_numpy, self.best)
+        observations, joint = (
+            torch.from_numpy(array).to(self.network.device) for array in self.best
+        )
         for _ in range(self.args.updates_per_episode):
-            scores = joint_values(self.network(seen), self.spec)
+            scores = joint_values(self.network(observations), self.spec)
             loss = nn.functional.cross_entropy(scores, joint)
             self.optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -158,38 +172,35 @@ class Tuner:
     def imagine(self) -> Episode | None:
         """Return the shortest of many imagined episodes, None if none visits all landmarks."""
         n_rows, problem = self.args.imagined, self.problem
-        sharpness = np.geomspace(*SHARPNESS, n_rows, dtype=np.float32)[:, None]
+        inverse_temperature = np.geomspace(*INVERSE_TEMPERATURES, n_rows, dtype=np.float32)
         cells = np.full((n_rows, self.spec.n_agents), problem.grid.depot)
         landmarks = np.tile(np.array(problem.landmarks), (n_rows, 1))
         visited = np.zeros(landmarks.shape, np.bool_)
-        world = make_world(problem.grid, self.spec.n_agents, self.spec.n_landmarks)
-        seen, taken = [], []
+        observations, taken = [], []
         limit = problem.max_cycles if self.best is None else len(self.best.joint)
         for _ in range(limit or 0):
             known = (self.moves[cells[:, None, :], self.digits] != UNKNOWN).all(axis=2)
             going_on = known.any(axis=1)  # the others are where nobody has moved from
             if not going_on.any():
                 return None
-            seen.append(join(cells, landmarks, visited))
+            observations.append(join(cells, landmarks, visited))
             with torch.inference_mode():
-                values = joint_values(self.network(torch.from_numpy(seen[-1])), self.spec)
+                given = torch.from_numpy(observations[-1]).to(self.network.device)
+                values = joint_values(self.network(given), self.spec).cpu().numpy()
             # The largest of logits and Gumbel noise is a draw from the policy.
-            scores = sharpness * values.numpy() + self.rng.gumbel(size=known.shape)
-            joint = np.where(known, scores, -np.inf).argmax(axis=1)
-            taken.append(joint)
-            moved = self.moves[cells, self.digits[joint]]
+            logits = inverse_temperature[:, None] * values
+            scores = logits + self.rng.gumbel(size=known.shape)
+            taken.append(np.where(known, scores, -np.inf).argmax(axis=1))
+            moved = self.moves[cells, self.digits[taken[-1]]]
             cells = np.where(going_on[:, None], moved, cells)
-            visited[going_on] = visit_rows(world, cells, landmarks, visited)[0][going_on]
-            done = visited.all(axis=1)
-            if done.any():
-                row = int(done.argmax())
-                return Episode(np.stack(seen)[:, row], np.stack(taken)[:, row])
+            visited, _, solved = visit_rows(self.world, cells, landmarks, visited)
+            if solved.any():
+                row = int(solved.argmax())
+                return Episode(np.stack(observations)[:, row], np.stack(taken)[:, row])
         return None
 
 
-def finetune(
-    args: Args, policy: NetworkPolicy, setting: Setting, problem: Problem
-) -> tuple[Plan, int]:
+def finetune(args: Args, policy: NetworkPolicy, problem: Problem) -> tuple[Plan, int]:
     """Return the best plan of the episodes played, and how many they were.
 
     It ends early when nothing has become better for a while.
@@ -202,7 +213,7 @@ def finetune(
     check_grid(policy, problem.grid)
     tuner = Tuner(args, policy.network, problem)
     env = mapp_v0.parallel_env(
-        setting.grid, setting.n_agents, setting.n_landmarks, setting.max_cycles
+        problem.grid, problem.n_agents, len(problem.landmarks), problem.max_cycles or 50
     )
     best: Plan | None = None
     waited = 0
@@ -210,7 +221,7 @@ def finetune(
         random = 0 < episode <= args.random_episodes  # the first shows what the policy can do
         if episode > args.random_episodes:
             tuner.train()
-        plan = run_episode(env, tuner, random)
+        plan = tuner.run_episode(env, random)
         waited += episode > args.random_episodes
         if best is None or (plan.success, -plan.cover_time) > (best.success, -best.cover_time):
             best, waited = plan, 0
@@ -220,25 +231,7 @@ def finetune(
     return best, args.episodes
 
 
-def run_episode(env: mapp_v0.parallel_env, tuner: Tuner, random: bool) -> Plan:
-    """Play an episode, greedily or at random, and remember where the moves led."""
-    leader = env.possible_agents[0]
-    policy = NetworkPolicy(tuner.network)
-    seen = env.reset(options={"landmarks": list(tuner.problem.landmarks)})[0][leader]
-    taken = []
-    while env.agents:
-        if random:
-            actions = tuner.rng.integers(N_ACTIONS, size=len(env.agents))
-        else:
-            actions = policy.act(seen[None])[0]
-        following = env.step(dict(zip(env.agents, actions.tolist(), strict=True)))[0][leader]
-        tuner.remember(seen, actions, following)
-        seen = following
-        taken.append(actions)
-    return replay(replace(tuner.problem, max_cycles=None), np.array(taken))
-
-
-def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[int, ...]]) -> None:
+def tune_many(args: Args, run: PolicyOfRun) -> None:
     """Fine-tune on random problems that the policy does not solve optimally, and count.
 
     Raises
@@ -246,9 +239,9 @@ def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[
     ValueError
         If the optimum of so many landmarks is not known.
     """
-    landmarks = unseen_problems(
-        setting, min(100 * args.problems, count_unseen(setting, seen)), seen, args.seed
-    )
+    policy, setting, known = run
+    n_problems = min(100 * args.problems, count_unseen(setting, known))
+    landmarks = unseen_problems(setting, n_problems, known, args.seed)
     optima = find_optima(setting, landmarks)
     if optima is None:
         raise ValueError(
@@ -260,19 +253,17 @@ def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[
     if not len(rows):
         print(f"the policy solves all of {len(landmarks):,} random problems optimally")
         return
-    seconds, gaps = [], []
-    for row in tqdm(rows, disable=None):
+    seconds, gaps = np.empty(len(rows)), np.empty(len(rows))
+    for index, row in enumerate(tqdm(rows, disable=None)):
         start = time.perf_counter()
-        problem = setting.problem(tuple(landmarks[row].tolist()))
-        plan, _ = finetune(args, policy, setting, problem)
-        seconds.append(time.perf_counter() - start)
-        gaps.append(plan.cover_time / optima.cover_time[row] - 1.0)
-    solved = np.isfinite(gaps)
-    found = int((np.array(gaps) == 0.0).sum())
+        plan, _ = finetune(args, policy, setting.problem(tuple(landmarks[row].tolist())))
+        seconds[index] = time.perf_counter() - start
+        gaps[index] = plan.cover_time / optima.cover_time[row] - 1.0
+    solved, found = np.isfinite(gaps), int((gaps == 0.0).sum())
     print(
         f"{len(rows)} problems that the policy does not solve optimally, of {len(landmarks):,}: "
         f"solved {solved.sum()}, the optimum found on {found} ({100 * found / len(rows):.1f} %), "
-        f"mean gap {100 * np.mean(np.array(gaps)[solved]) if solved.any() else np.nan:.2f} %, "
+        f"mean gap {100 * np.mean(gaps[solved]) if solved.any() else np.nan:.2f} %, "
         f"{np.mean(seconds):.1f} s each on average, {max(seconds):.1f} s at most"
     )
 
@@ -280,14 +271,14 @@ def study(args: Args, policy: NetworkPolicy, setting: Setting, seen: list[tuple[
 def main(args: Args) -> int:
     """Fine-tune on one problem; return the exit code."""
     torch.set_num_threads(1)
-    policy, setting, seen = load_run(args.policy)
+    run = load_run(args.policy, args.device)
     if args.problems:
-        study(args, policy, setting, seen)
+        tune_many(args, run)
         return 0
-    problem = setting.problem(args.landmarks)
-    before = play(policy, [problem])[0]
+    problem = run.setting.problem(args.landmarks)
+    (before,) = play(run.policy, [problem])
     start = time.perf_counter()
-    after, n_episodes = finetune(args, policy, setting, problem)
+    after, n_episodes = finetune(args, run.policy, problem)
     seconds = time.perf_counter() - start
     optimum = solve(problem)
     plans = {"policy": before, "fine-tuned": after}

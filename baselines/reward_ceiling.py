@@ -15,6 +15,7 @@ largest are for ties broken at their worst.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -22,13 +23,15 @@ import numpy as np
 import tyro
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.policies.evaluation import EVALUATION_SEED, Setting, find_optima, unseen_problems
-from mapp_env import Grid
+from baselines.policies.evaluation import EVALUATION_SEED, find_optima, unseen_problems
+from baselines.policies.settings import N_ACTIONS, Setting
+from mapp_env.engine.loops import visit_rows
+from mapp_env.engine.rules import Reward
+from mapp_env.engine.task import make_world
 from mapp_env.grids import find_grid
 from mapp_env.validation import check_choice, check_count, check_number
 
-REWARDS = ("manhattan", "geodesic", "step")
-N_ACTIONS = 4
+REWARDS = tuple(reward.name.lower() for reward in Reward)
 MAX_STATES = 2**26  # half a gigabyte of values
 SAME = 1e-9  # values closer than this are a tie
 LEAST_WEIGHT = 10 * SAME  # of the last step of an episode, seen from the first
@@ -47,33 +50,31 @@ class RewardModel:
 
     def __init__(self, setting: Setting, landmarks: Sequence[int], reward: str) -> None:
         grid = setting.grid
-        cells = np.sort(np.append(grid.reachable, grid.depot))
+        self.cells = np.sort(np.append(grid.reachable, grid.depot))
         place_of = np.full(grid.n_cells, -1)
-        place_of[cells] = np.arange(len(cells))
-        self.n_agents, self.n_landmarks = setting.n_agents, len(landmarks)
-        self.moves = place_of[np.asarray(grid.moves)[cells, :N_ACTIONS]]  # (places, 4)
+        place_of[self.cells] = np.arange(len(self.cells))
+        self.moves = place_of[np.asarray(grid.moves)[self.cells, :N_ACTIONS]]  # (places, 4)
         self.depot = int(place_of[grid.depot])
-        self.shape = (len(cells),) * self.n_agents
-        to_landmark = distances_to(grid, landmarks, reward)[:, cells]  # (K, places)
-        # Per landmark, over the places: whether an agent stands on it, the distance of the nearest.
-        on = [cells == landmark for landmark in landmarks]
-        self.visited = [self._over_agents(np.logical_or, mask) for mask in on]
-        self.nearest = [self._over_agents(np.minimum, steps) for steps in to_landmark]
+        self.n_agents, self.n_landmarks = setting.n_agents, len(landmarks)
+        self.shape = (len(self.cells),) * self.n_agents
+        self.everywhere = np.indices(self.shape).reshape(self.n_agents, -1).T
+        self.landmarks, self.bits = np.array(landmarks), 1 << np.arange(self.n_landmarks)
+        kind = Reward[reward.upper()]
+        self.world = make_world(grid, self.n_agents, self.n_landmarks, kind)
 
-    def _over_agents(self, combine: np.ufunc, line: np.ndarray) -> np.ndarray:
-        """Combine one value per agent's place into an array over all agents' places."""
-        whole = line
-        for _ in range(self.n_agents - 1):
-            whole = combine(whole[..., None], line)
-        return whole
+    def arrive(
+        self, places: np.ndarray, unvisited: int | np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return what the rules make of moving to places (B, N), with the set of before, or (B,).
 
-    def rewards(self, unvisited: int, reward: str) -> np.ndarray:
-        """Return the reward (R6) for having moved to each places; the set is that of before."""
-        left = [k for k in range(self.n_landmarks) if unvisited >> k & 1]
-        if reward == "step":
-            return np.logical_and.reduce([self.visited[k] for k in left]) - 1.0
-        # A landmark under an agent is at distance 0, so it drops out by itself.
-        return -np.sum([self.nearest[k] for k in left], axis=0, dtype=np.float64)
+        Returns
+        -------
+        left, rewards
+            (B,) the set of landmarks that are unvisited then (R5), and the rewards (R6).
+        """
+        visited = (np.broadcast_to(unvisited, len(places))[:, None] & self.bits) == 0
+        visited, rewards, _ = visit_rows(self.world, self.cells[places], self.landmarks, visited)
+        return ~visited @ self.bits, rewards
 
     def best_neighbour(self, values: np.ndarray) -> np.ndarray:
         """Return the largest value that one joint action leads to, for all places."""
@@ -92,21 +93,20 @@ class Solved:
     arrival: list[np.ndarray]  # per set: value of moving to places, the reward included
 
 
-def iterate_values(model: RewardModel, reward: str, discount: float) -> Solved:
+def iterate_values(model: RewardModel, discount: float) -> Solved:
     """Return the optimal values: one set of unvisited landmarks after another, smaller ones first.
 
     With a landmark under an agent the set is in truth a smaller one, whose values are known; the
     other places are iterated until nothing moves.
     """
-    values = [np.zeros(model.shape)]  # by set; nothing is left to lose when all are visited
-    arrival = [np.zeros(model.shape)]
-    for unvisited in range(1, 1 << model.n_landmarks):
-        value = np.full(model.shape, WORST)
-        for k in range(model.n_landmarks):
-            if unvisited >> k & 1:
-                value = np.where(model.visited[k], values[unvisited ^ (1 << k)], value)
-        open_places = value == WORST
-        rewards = model.rewards(unvisited, reward)
+    values = np.zeros((1 << model.n_landmarks, *model.shape))  # nothing is left to lose in the end
+    arrival = [values[0]]
+    for unvisited in range(1, len(values)):
+        arrived = model.arrive(model.everywhere, unvisited)
+        left, rewards = (array.reshape(model.shape) for array in arrived)
+        open_places = left == unvisited
+        known = values.reshape(len(values), -1)[left.ravel(), np.arange(left.size)]
+        value = np.where(open_places, WORST, known.reshape(model.shape))
         while True:
             arriving = rewards + discount * value
             new = np.where(open_places, model.best_neighbour(arriving), value)
@@ -114,16 +114,9 @@ def iterate_values(model: RewardModel, reward: str, discount: float) -> Solved:
             value = new
             if settled:
                 break
-        values.append(value)
+        values[unvisited] = value
         arrival.append(rewards + discount * value)
     return Solved(model, arrival)
-
-
-def distances_to(grid: Grid, landmarks: Sequence[int], reward: str) -> np.ndarray:
-    """Return what the reward calls a distance from each landmark to each cell: (K, C)."""
-    if reward == "geodesic":
-        return np.asarray(grid.distances_from(landmarks))
-    return np.asarray(grid.manhattan_from(landmarks))
 
 
 # -- the policy that is optimal for them -------------------------------------------------------
@@ -141,16 +134,18 @@ class CoverTimes:
 def cover_times(solved: Solved, max_cycles: int) -> CoverTimes:
     """Follow all optimal joint actions from the depot, each with its probability."""
     model = solved.model
-    everything = (1 << model.n_landmarks) - 1
-    now = {((model.depot,) * model.n_agents, everything): 1.0}
+    now = {((model.depot,) * model.n_agents, (1 << model.n_landmarks) - 1): 1.0}
     best, mean = math.inf, 0.0
     for step in range(1, max_cycles + 1):
-        after: dict[tuple[tuple[int, ...], int], float] = {}
+        moved: Counter[tuple[tuple[int, ...], int]] = Counter()
         for (places, unvisited), chance in now.items():
             ties = optimal_moves(solved, places, unvisited)
             for target in ties:
-                key = (target, left_after(model, target, unvisited))
-                after[key] = after.get(key, 0.0) + chance / len(ties)
+                moved[target, unvisited] += chance / len(ties)
+        targets, sets = map(np.array, zip(*moved, strict=True))
+        after: Counter[tuple[tuple[int, ...], int]] = Counter()
+        for key, left in zip(moved, model.arrive(targets, sets)[0].tolist(), strict=True):
+            after[key[0], left] += moved[key]
         finished = sum(chance for (_, left), chance in after.items() if left == 0)
         if finished:
             best = min(best, step)
@@ -163,21 +158,10 @@ def cover_times(solved: Solved, max_cycles: int) -> CoverTimes:
 
 def optimal_moves(solved: Solved, places: tuple[int, ...], unvisited: int) -> list[tuple[int, ...]]:
     """Return the places that each optimal joint action leads to; two actions may agree."""
-    block = solved.arrival[unvisited][np.ix_(*(solved.model.moves[place] for place in places))]
-    chosen = np.argwhere(block >= block.max() - SAME).tolist()
     moves = solved.model.moves
-    return [
-        tuple(int(moves[place, action]) for place, action in zip(places, actions, strict=True))
-        for actions in chosen
-    ]
-
-
-def left_after(model: RewardModel, places: tuple[int, ...], unvisited: int) -> int:
-    """Return the landmarks still unvisited after moving to places."""
-    for k in range(model.n_landmarks):
-        if model.visited[k][places]:
-            unvisited &= ~(1 << k)
-    return unvisited
+    block = solved.arrival[unvisited][np.ix_(*(moves[place] for place in places))]
+    chosen = np.argwhere(block >= block.max() - SAME)  # (ties, N)
+    return list(map(tuple, moves[np.array(places), chosen].tolist()))
 
 
 # -- from the command line ---------------------------------------------------------------------
@@ -222,15 +206,12 @@ class Args:
             )
 
 
-def study(
+def all_cover_times(
     setting: Setting, landmarks: Iterable[Sequence[int]], reward: str, discount: float
 ) -> list[CoverTimes]:
     """Return the cover times of each problem."""
-    found = []
-    for row in landmarks:
-        model = RewardModel(setting, row, reward)
-        found.append(cover_times(iterate_values(model, reward, discount), setting.max_cycles))
-    return found
+    models = (RewardModel(setting, row, reward) for row in landmarks)
+    return [cover_times(iterate_values(model, discount), setting.max_cycles) for model in models]
 
 
 def format_row(label: str, found: list[CoverTimes], optimum: np.ndarray) -> str:
@@ -272,7 +253,7 @@ def main(args: Args) -> None:
     print("|-----------|---------:|-------:|------------------:|----------:|------------:|")
     for reward in args.rewards:
         rows = tqdm(landmarks.tolist(), desc=reward, leave=False, disable=None)
-        found = study(setting, rows, reward, args.discount)
+        found = all_cover_times(setting, rows, reward, args.discount)
         print(format_row(reward, found, optima.cover_time), flush=True)
 
 

@@ -23,17 +23,18 @@ import importlib.util
 import time
 from collections.abc import Callable
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from baselines.policies.acting import Acting, check_grid
+from baselines.policies import load_policy, play
+from baselines.policies.acting import Acting
 from baselines.policies.evaluation import Optima, evaluate, find_optima
-from baselines.policies.policy import NetworkPolicy, load_policy, pretrained_names
+from baselines.policies.policy import pretrained_names
 from baselines.policies.rules_of_thumb import rules_of_thumb
 from baselines.policies.settings import Setting
-from mapp_env import Problem, make_grid, replay, sample_problems, solve
+from mapp_env import Problem, make_grid, sample_problems, solve
 from mapp_env.solvers import optimal_costs
 from mapp_env.solvers.pyvrp import solve_pyvrp
 from mapp_env.solvers.search import solve_search
@@ -50,24 +51,21 @@ class Row(NamedTuple):
     optimal: float | None  # percent of the problems
 
 
+def time_one(function: Callable[[Any], object], given: object) -> float:
+    """Return the seconds that a function takes."""
+    start = time.perf_counter()
+    function(given)
+    return time.perf_counter() - start
+
+
 def time_each(function: Callable[[Problem], object], problems: list[Problem]) -> float:
     """Return a function's median time in milliseconds."""
-    times = []
-    for problem in problems:
-        start = time.perf_counter()
-        function(problem)
-        times.append(time.perf_counter() - start)
-    return 1e3 * median(times)
+    return 1e3 * median(time_one(function, problem) for problem in problems)
 
 
 def time_batch(function: Callable[[np.ndarray], object], landmarks: np.ndarray) -> float:
     """Return microseconds per problem, the best of three."""
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        function(landmarks)
-        times.append(time.perf_counter() - start)
-    return 1e6 * min(times) / len(landmarks)
+    return 1e6 * min(time_one(function, landmarks) for _ in range(3)) / len(landmarks)
 
 
 def time_search(solver: Callable[..., object], problem: Problem, optimum: int) -> float:
@@ -87,47 +85,16 @@ def policy_rows(
     label: str, policy: Acting, problems: list[Problem], many: np.ndarray, optima: Optima | None
 ) -> list[Row]:
     """Return the rows of a policy: one step, and whole episodes."""
-    n_flags = SETTING.n_landmarks
+    n, k = SETTING.n_agents, SETTING.n_landmarks
     starts = {
-        problem: np.array(
-            [[problem.grid.depot] * SETTING.n_agents + [*problem.landmarks] + [0] * n_flags],
-            np.float32,
-        )
+        problem: np.array([[*[problem.grid.depot] * n, *problem.landmarks, *[0] * k]], np.float32)
         for problem in problems
     }
     shortest = evaluate(policy, SETTING, many, optima).summary()["optimal %"]
     step = time_each(lambda problem: policy.act(starts[problem]), problems)
-    whole = time_each(
-        lambda problem: replay(
-            problem,
-            evaluate(policy, SETTING, np.array([problem.landmarks]), n_kept=1).actions[:, 0],
-        ),
-        problems,
-    )
+    whole = time_each(lambda problem: play(policy, [problem]), problems)
     each = time_batch(lambda landmarks: evaluate(policy, SETTING, landmarks), many)
     return [Row(f"{label}, one step", step, None, None), Row(label, whole, each, shortest)]
-
-
-def load_fitting(name: str) -> NetworkPolicy:
-    """Load a policy for the benchmark's setting.
-
-    Raises
-    ------
-    ValueError
-        If there is no such policy, or it is for another setting.
-    """
-    policy = load_policy(name)
-    try:
-        check_grid(policy, SETTING.grid)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    for what, wanted in (
-        ("n_agents", SETTING.n_agents),
-        ("n_landmarks", SETTING.n_landmarks),
-    ):
-        if getattr(policy.spec, what) != wanted:
-            raise ValueError(f"{name}: {what} must be {wanted}, got {getattr(policy.spec, what)}")
-    return policy
 
 
 def main() -> None:
@@ -137,14 +104,17 @@ def main() -> None:
     parser.add_argument("--problems", type=int, default=100, help="problems solved singly")
     parser.add_argument("--batch", type=int, default=20_000, help="problems solved together")
     args = parser.parse_args()
-    try:
-        policies = {name: load_fitting(name) for name in args.policies}
-    except ValueError as error:
-        parser.error(f"--policies: {error}")
     torch.set_num_threads(1)
     grid, n_agents = SETTING.grid, SETTING.n_agents
     many = sample_problems(grid, args.batch, SETTING.n_landmarks, seed=1)
-    problems = [Problem(grid, row, n_agents) for row in many[: args.problems].tolist()]
+    problems = [SETTING.problem(tuple(row)) for row in many[: args.problems].tolist()]
+    policies = {}
+    for name in args.policies:
+        try:
+            policies[name] = load_policy(name)
+            play(policies[name], problems[:1])  # refused if it is for another setting
+        except ValueError as error:
+            parser.error(f"--policies: {name}: {error}")
     optima = find_optima(SETTING, many)
     rows: list[Row] = []
     for name in args.policies:

@@ -124,6 +124,11 @@ class Network(nn.Module):
         super().__init__()
         self.spec = spec
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return next(self.parameters()).device
+
     def forward(self, observations: Tensor) -> Tensor:
         """Return action values, (B, N, A) or (B, A ** N), of global observations (B, N + 2K).
 

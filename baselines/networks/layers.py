@@ -57,7 +57,7 @@ class EmbeddingBag(nn.Module):
 
     def forward(self, indices: Tensor) -> Tensor:
         """Return sums (B, units) of the vectors of each bag (B, n) int64."""
-        if self.weight.device.type == "cpu":
+        if self.weight.is_cpu:
             total: Tensor = SumRowsOnCPU.apply(self.weight, indices)  # type: ignore
             return total
         return nn.functional.embedding_bag(indices, self.weight, mode="sum")
@@ -104,5 +104,7 @@ def encode(
     What a network is given in place of numbers of cells, rows of its tables or distances, is
     computed by loops on the CPU, before the network and wherever that is.
     """
+    if observations.is_cpu:
+        return [torch.from_numpy(array) for array in encoder(observations.numpy(), *args)]
     encoded = encoder(observations.cpu().numpy(), *args)
     return [torch.from_numpy(array).to(observations.device) for array in encoded]

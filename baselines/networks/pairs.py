@@ -14,6 +14,7 @@ from baselines.networks.layers import EmbeddingBag, Head, encode, linear
 from mapp_env.compiled import nogil_kernel
 from mapp_env.validation import check_count
 
+NONE = np.zeros(0, np.int64)  # rows of a table that a network does without
 MAX_SORTED_AGENTS = 5  # 5 ** 5 orders of agents, of which each has a table of joint actions
 
 
@@ -149,13 +150,13 @@ def rows_to_look_up(observations: np.ndarray, spec: PairsSpec) -> tuple[np.ndarr
     through, between
         From :func:`routes` and :func:`between_landmarks`; empty without such tables.
     """
-    n_cells, none = spec.n_cells, np.zeros(0, np.int64)
+    n_cells = spec.n_cells
     pairs, landmarks, order = arrange(
         observations, spec.n_agents, spec.n_landmarks, n_cells, spec.team == "one"
     )
-    through = routes(pairs, landmarks, n_cells) if spec.route_units else none
+    through = routes(pairs, landmarks, n_cells) if spec.route_units else NONE
     both = spec.route_units and spec.landmark_units
-    between = between_landmarks(landmarks, n_cells) if both else none
+    between = between_landmarks(landmarks, n_cells) if both else NONE
     return pairs, landmarks, order, through, between
 
 

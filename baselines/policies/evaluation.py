@@ -40,12 +40,12 @@ MAX_EXACT_LANDMARKS = 20  # of solve(method="exact")
 def unseen_problems(
     setting: Setting,
     n_problems: int,
-    seen: Sequence[Sequence[int]] = (),
+    exclude: Sequence[Sequence[int]] = (),
     seed: int = EVALUATION_SEED,
 ) -> np.ndarray:
-    """Draw distinct problems, none of them in `seen` (in whatever order): (n_problems, K)."""
+    """Draw distinct problems, none of the excluded (in whatever order): (n_problems, K)."""
     return sample_problems(
-        setting.grid, n_problems, n_landmarks=setting.n_landmarks, seed=seed, exclude=seen
+        setting.grid, n_problems, n_landmarks=setting.n_landmarks, seed=seed, exclude=exclude
     )
 
 
@@ -54,9 +54,9 @@ def count_problems(setting: Setting) -> int:
     return math.comb(setting.grid.reachable.size, setting.n_landmarks)
 
 
-def count_unseen(setting: Setting, seen: Sequence[Sequence[int]]) -> int:
-    """Return how many problems of the setting there are besides those in `seen`."""
-    return count_problems(setting) - len({tuple(sorted(landmarks)) for landmarks in seen})
+def count_unseen(setting: Setting, exclude: Sequence[Sequence[int]]) -> int:
+    """Return how many problems of the setting there are besides the excluded."""
+    return count_problems(setting) - len({tuple(sorted(landmarks)) for landmarks in exclude})
 
 
 def every_problem(setting: Setting) -> np.ndarray:
@@ -91,15 +91,12 @@ def find_optima(setting: Setting, landmarks: np.ndarray) -> Optima | None:
 
 def out_of_reach(setting: Setting, optima: Optima | None) -> list[str]:
     """Return a line on problems whose optimum already takes more than the step limit, if any."""
-    if optima is None:
-        return []
-    count = int((optima.cover_time > setting.max_cycles).sum())
-    if count == 0:
-        return []
-    return [
-        f"out of reach: {count:,} of {len(optima.cover_time):,} problems take more than "
-        f"{setting.max_cycles} steps at their optimum (the limit is --max-cycles)"
-    ]
+    least = np.zeros(1) if optima is None else optima.cover_time
+    line = (
+        f"out of reach: {(least > setting.max_cycles).sum():,} of {len(least):,} problems take "
+        f"more than {setting.max_cycles} steps at their optimum (the limit is --max-cycles)"
+    )
+    return [line] if (least > setting.max_cycles).any() else []
 
 
 def _optimal_costs(setting: Setting, landmarks: np.ndarray, objective: str) -> np.ndarray:
@@ -298,12 +295,8 @@ def table_rows(evaluations: dict[str, Evaluation]) -> dict[str, dict[str, float]
     rows = {label: evaluation.summary() for label, evaluation in evaluations.items()}
     first = next(iter(evaluations.values()))
     if first.optima is not None:
-        costs = {name: float(getattr(first.optima, name).mean()) for name in OBJECTIVES}
-        figures = (
-            *(len(first.success), 100.0, 0.0, 100.0, 0.0),
-            *(costs["cover_time"], costs["cover_time"], costs["makespan"]),
-            costs["total_distance"],
-        )
+        cover_time, *others = (float(getattr(first.optima, name).mean()) for name in OBJECTIVES)
+        figures = (len(first.success), 100.0, 0.0, 100.0, 0.0, cover_time, cover_time, *others)
         rows["optimum of each cost"] = dict(zip(first.summary(), figures, strict=True))
     return rows
 
@@ -314,18 +307,13 @@ def format_table(evaluations: dict[str, Evaluation]) -> str:
     lines = [["policy", *next(iter(rows.values()))]]
     for label, figures in rows.items():
         lines.append([label, *(_format_cell(name, value) for name, value in figures.items())])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    texts = [
-        "| "
-        + " | ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        + " |"
-        for line in lines
-    ]
-    ruler = "|" + "|".join("-" * (w + 1) + (":" if c else "-") for c, w in enumerate(widths)) + "|"
-    return "\n".join([texts[0], ruler, *texts[1:]])
+    first, *others = (max(map(len, column)) for column in zip(*lines, strict=True))
+    texts = []
+    for label, *cells in lines:
+        figures_of = (cell.rjust(width) for cell, width in zip(cells, others, strict=True))
+        texts.append(f"| {' | '.join([label.ljust(first), *figures_of])} |")
+    ruler = "|".join(["-" * (first + 2), *("-" * (width + 1) + ":" for width in others)])
+    return "\n".join([texts[0], f"|{ruler}|", *texts[1:]])
 
 
 def _format_cell(name: str, value: float) -> str:
@@ -347,7 +335,6 @@ def save_table(folder: Path, evaluations: dict[str, Evaluation]) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["policy", *next(iter(rows.values()))])
-    for label, figures in rows.items():
-        writer.writerow([label, *figures.values()])
+    writer.writerows([label, *figures.values()] for label, figures in rows.items())
     write_text(folder / "evaluation.csv", text.getvalue(), MAX_TABLE_BYTES)
     write_text(folder / "evaluation.md", format_table(evaluations) + "\n", MAX_TABLE_BYTES)

@@ -14,10 +14,10 @@ import numpy as np
 
 from baselines.policies.acting import Acting, check_grid, check_observations
 from mapp_env import Grid
+from mapp_env.engine.state import N_ACTIONS, split
 from mapp_env.validation import check_count, check_number
 
 NO_DIRECTION = -1
-N_DIRECTIONS = 4  # left, right, up, down; a wait directs nobody
 
 
 class LinearSchedule:
@@ -49,14 +49,12 @@ class Guidance:
         The nearest landmark wins; of two equally near ones, the first action in the order left,
         right, up, down.
         """
-        n, k = self.n_agents, self.n_landmarks
-        cells = observations[:, :n].astype(np.int64)
-        landmarks = observations[:, n : n + k].astype(np.int64)
-        unvisited = np.where(observations[:, n + k :] > 0.5, -2, landmarks)  # -2 is on no ray
-        in_sight = (self.rays[cells][..., None] == unvisited[:, None, None, :]).any(axis=-1)
+        state = split(observations.astype(np.int64), self.n_agents, self.n_landmarks)
+        unvisited = np.where(state.visited > 0, -2, state.landmarks)  # -2 is on no ray
+        in_sight = (self.rays[state.cells][..., None] == unvisited[:, None, None, :]).any(axis=-1)
         nearest = in_sight.argmax(axis=-1)  # the first in sight: rays run from near to far
         found = np.take_along_axis(in_sight, nearest[..., None], axis=-1)[..., 0]
-        return np.where(found, nearest % N_DIRECTIONS, NO_DIRECTION)
+        return np.where(found, nearest % N_ACTIONS, NO_DIRECTION)
 
     def apply(
         self,
@@ -99,17 +97,17 @@ class GuidedPolicy:
 
 
 def sight_rays(grid: Grid, reach: int) -> np.ndarray:
-    """Cells seen from every cell: (C, reach * 4), near before far, -1 behind a wall or border.
+    """Cells in sight of every cell: (C, reach * 4), from near to far, -1 behind a wall or border.
 
     Column ``4 * d + a`` is the cell reached by d + 1 moves of action a without a bump.
     """
-    moves = np.asarray(grid.moves)[:, :N_DIRECTIONS].astype(np.int64)
-    here = np.repeat(np.arange(grid.n_cells)[:, None], N_DIRECTIONS, axis=1)  # (C, 4)
+    moves = np.asarray(grid.moves)[:, :N_ACTIONS].astype(np.int64)
+    here = np.repeat(np.arange(grid.n_cells)[:, None], N_ACTIONS, axis=1)  # (C, 4)
     clear = np.ones(here.shape, np.bool_)
-    rays = np.full((grid.n_cells, reach, N_DIRECTIONS), -1, np.int64)
+    rays = np.full((grid.n_cells, reach, N_ACTIONS), -1, np.int64)
     for distance in range(reach):
-        there = moves[here, np.arange(N_DIRECTIONS)]
+        there = moves[here, np.arange(N_ACTIONS)]
         clear &= there != here
         rays[:, distance] = np.where(clear, there, -1)
         here = there
-    return rays.reshape(grid.n_cells, reach * N_DIRECTIONS)
+    return rays.reshape(grid.n_cells, reach * N_ACTIONS)

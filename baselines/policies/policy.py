@@ -53,9 +53,9 @@ class NetworkPolicy:
         """
         spec = self.spec
         checked = check_observations(observations, spec.n_agents, spec.n_landmarks, spec.n_cells)
-        device = next(self.network.parameters()).device
+        given = torch.from_numpy(checked).to(self.network.device)
         with torch.inference_mode():
-            return greedy_actions(self.network(torch.from_numpy(checked).to(device)), spec)
+            return greedy_actions(self.network(given), spec)
 
 
 def save_policy(
@@ -121,8 +121,8 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> NetworkPol
     ------
     ValueError
         If there is no such file, or it is damaged, was written by something else, or its weights
-        have other names, shapes or dtypes than its network, or are not finite. No code is run
-        from the file.
+        have other names, shapes or dtypes than its network, or are not finite; or if there is no
+        such device. No code is run from the file.
     """
     file = find_weights(path)
     content = read_bytes(file, MAX_WEIGHTS_BYTES, "a weights file", ValueError)
@@ -135,7 +135,13 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> NetworkPol
     except safetensors.SafetensorError as error:
         raise ValueError(f"{file}: damaged weights: {error}") from error
     network.load_state_dict(weights)
-    return NetworkPolicy(network.to(device).eval(), grid)
+    try:
+        network.to(device)
+    except (RuntimeError, AssertionError) as error:  # unknown to PyTorch, or not on this machine
+        raise ValueError(
+            f"device must be one that PyTorch has here, got {device!r}: {error}"
+        ) from (error)
+    return NetworkPolicy(network.eval(), grid)
 
 
 def check_weights(network: Network, weights: dict[str, torch.Tensor]) -> None:

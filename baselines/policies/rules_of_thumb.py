@@ -5,6 +5,7 @@ import numpy as np
 from baselines.policies.acting import Acting, check_observations, check_rows
 from baselines.policies.settings import Setting
 from mapp_env import Grid
+from mapp_env.engine.state import split
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.validation import check_count
@@ -54,11 +55,9 @@ class NearestLandmarkPolicy:
         """
         n, k = self.n_agents, self.n_landmarks
         observations = check_observations(observations, n, k, len(self.distances))
-        cells = observations[:, :n].astype(np.int64)
-        landmarks = observations[:, n : n + k].astype(np.int64)
-        actions: np.ndarray = self.first_moves[
-            cells, self.choose(cells, landmarks, observations[:, n + k :] < 0.5)
-        ]
+        state = split(observations.astype(np.int64), n, k)
+        chosen = self.choose(state.cells, state.landmarks, state.visited == 0)
+        actions: np.ndarray = self.first_moves[state.cells, chosen]
         return actions
 
     def choose(self, cells: np.ndarray, landmarks: np.ndarray, left: np.ndarray) -> np.ndarray:

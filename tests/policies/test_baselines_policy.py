@@ -191,6 +191,14 @@ def test_a_policy_has_the_grid_of_its_weights(tmp_path, network):
     assert NetworkPolicy(network).grid is None
 
 
+@pytest.mark.parametrize("device", ["nowhere", "cpu:x", "cuda:77"])
+def test_devices_that_are_not_there_are_refused(device):
+    """Unknown to PyTorch, or not on this machine."""
+    with pytest.raises(ValueError, match=f"^device must be one that PyTorch has.*{device}"):
+        load_policy("pretrained", device)
+    assert load_policy("pretrained", "cpu").network.device.type == "cpu"
+
+
 def test_weights_and_their_grid_fit_together(tmp_path, network, weights):
     """A grid of another number of cells is neither written nor read, nor is any grid at all."""
     for grid, said in ((Grid.from_text("D.."), "one of 3"), (None, "any grid")):

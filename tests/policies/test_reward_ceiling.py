@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from baselines import reward_ceiling
-from baselines.policies.evaluation import Setting, find_optima, unseen_problems
+from baselines.policies.evaluation import find_optima, unseen_problems
+from baselines.policies.settings import Setting
 from baselines.reward_ceiling import (
     CoverTimes,
     RewardModel,
     Solved,
+    all_cover_times,
     cover_times,
     iterate_values,
-    left_after,
     optimal_moves,
-    study,
 )
 from mapp_env import Grid, make_grid, mapp_v0
 
@@ -39,6 +39,12 @@ def play(setting: Setting, landmarks, actions, reward: str):
     return rewards, terminated
 
 
+def left_after(model, places, unvisited):
+    """Return the set of landmarks left after a move to places, and its reward."""
+    left, rewards = model.arrive(np.array([places]), unvisited)
+    return int(left[0]), float(rewards[0])
+
+
 def value_at_depot(solved) -> float:
     """Return the value of the start, over all joint actions."""
     model = solved.model
@@ -55,7 +61,7 @@ def test_no_sequence_of_actions_is_worth_more(reward, n_agents, depth):
     joint_actions = list(itertools.product(range(4), repeat=n_agents))
     for landmarks in ((0, 8), (5, 8), (2, 6)):
         model = RewardModel(setting, landmarks, reward)
-        solved = iterate_values(model, reward, discount)
+        solved = iterate_values(model, discount)
         best = -np.inf
         for sequence in itertools.product(joint_actions, repeat=depth):
             rewards, terminated = play(setting, landmarks, sequence, reward)
@@ -75,7 +81,7 @@ def test_optimal_policy_earns_its_value(reward):
     discount = 0.95
     for landmarks in unseen_problems(setting, 5).tolist():
         model = RewardModel(setting, landmarks, reward)
-        solved = iterate_values(model, reward, discount)
+        solved = iterate_values(model, discount)
         times = cover_times(solved, setting.max_cycles)
         places, unvisited, actions = (model.depot,) * 2, 7, []
         while unvisited:
@@ -83,7 +89,7 @@ def test_optimal_policy_earns_its_value(reward):
             target = options[rng.integers(len(options))]
             moves = zip(places, target, strict=True)
             actions.append([model.moves[a].tolist().index(b) for a, b in moves])
-            places, unvisited = target, left_after(model, target, unvisited)
+            places, unvisited = target, left_after(model, target, unvisited)[0]
         rewards, terminated = play(setting, landmarks, actions, reward)
         assert terminated
         assert times.best <= len(actions) <= times.worst
@@ -97,7 +103,7 @@ def test_counting_steps_has_no_ceiling():
     landmarks = unseen_problems(setting, 20)
     optimum = find_optima(setting, landmarks).cover_time
     for discount in (1.0, 0.95):
-        found = study(setting, landmarks.tolist(), "step", discount)
+        found = all_cover_times(setting, landmarks.tolist(), "step", discount)
         for name in ("at_random", "best", "worst"):
             times = np.array([getattr(times, name) for times in found])
             np.testing.assert_allclose(times, optimum)
@@ -115,8 +121,8 @@ def test_rewards_are_those_of_the_environment(reward):
     for joint_action, earned in zip(actions, rewards, strict=True):
         moves = zip(places, joint_action, strict=True)
         places = tuple(int(model.moves[place, action]) for place, action in moves)
-        assert model.rewards(unvisited, reward)[places] == earned
-        unvisited = left_after(model, places, unvisited)
+        unvisited, reward_of_model = left_after(model, places, unvisited)
+        assert reward_of_model == earned
     assert unvisited < 31
 
 
@@ -141,7 +147,7 @@ def test_ties_are_followed_to_their_end():
     """Without foresight every move is a tie: at best 7 steps, at worst the limit is not enough."""
     setting = Setting(Grid.from_text("...D.."), 1, 2, 50)
     model = RewardModel(setting, (0, 5), "step")
-    solved = iterate_values(model, "step", 0.0)  # sees one step: no move is better than another
+    solved = iterate_values(model, 0.0)  # sees one step: no move is better than another
     times = cover_times(solved, 9)
     assert np.isinf([times.at_random, times.worst]).all()
     assert times.best == 7  # twice 2 to the right, then 5 to the left
@@ -158,7 +164,7 @@ def test_too_many_states_are_refused():
 def test_discounts_that_lose_late_steps_are_refused():
     """Where a step more or less vanishes in the values, ties would be false: nobody is told so."""
     setting = Setting(Grid(np.zeros((1, 15), np.bool_), depot=0), 1, 1, 50)
-    (times,) = study(setting, [(14,)], "step", 0.1)
+    (times,) = all_cover_times(setting, [(14,)], "step", 0.1)
     assert times.worst > 14  # a gap, though there is none
     for discount, limit in ((0.1, 50), (0.0, 1), (0.95, 500)):
         with pytest.raises(ValueError, match=r"discount \*\* max_cycles must be at least 1e-08"):
@@ -188,6 +194,6 @@ def test_the_mean_lies_between_the_extremes():
     setting = Setting(Grid.from_text("...\n.D.\n..."), 2, 2, 30)
     for landmarks in unseen_problems(setting, 12).tolist():
         for reward in REWARDS:
-            (times,) = study(setting, [landmarks], reward, 0.9)
+            (times,) = all_cover_times(setting, [landmarks], reward, 0.9)
             assert times.best <= times.at_random + 1e-9
             assert times.at_random <= times.worst + 1e-9

@@ -60,13 +60,13 @@ def test_fine_tuning_finds_the_optimum(kind, outputs, team):
     )
     policy = untrained(kind, outputs, team)
     before = {name: tensor.clone() for name, tensor in policy.network.state_dict().items()}
-    plan, n_episodes = finetune.finetune(args, policy, SETTING, problem)
+    plan, n_episodes = finetune.finetune(args, policy, problem)
     assert n_episodes <= 30
     plan.verify(problem)
     assert plan.cover_time == optimal_costs(GRID, [CELLS], 2)[0]
     for name, tensor in policy.network.state_dict().items():
         assert torch.equal(tensor, before[name])  # the policy itself is left as it was
-    again, _ = finetune.finetune(args, policy, SETTING, problem)
+    again, _ = finetune.finetune(args, policy, problem)
     assert again.tours == plan.tours
 
 
@@ -75,7 +75,7 @@ def test_fine_tuning_never_makes_it_worse():
     problem = SETTING.problem(CELLS)
     before = play(untrained(), [problem])[0]
     args = finetune.Args(landmarks=CELLS, episodes=1)
-    after, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
+    after, n_episodes = finetune.finetune(args, untrained(), problem)
     assert n_episodes == 1
     assert (after.success, after.cover_time) == (before.success, before.cover_time)
 
@@ -87,26 +87,26 @@ def test_the_best_episode_counts_and_waiting_ends(monkeypatch):
     longer = [replace(optimum, cover_time=optimum.cover_time + n) for n in range(9)]
     # The policy's own, two at random, then those after training.
     plans = iter([longer[8], longer[8], longer[5], longer[6], longer[3], longer[4], longer[7]])
-    monkeypatch.setattr(finetune, "run_episode", lambda env, tuner, random: next(plans))
+    monkeypatch.setattr(finetune.Tuner, "run_episode", lambda tuner, env, random: next(plans))
     monkeypatch.setattr(finetune.Tuner, "train", lambda tuner: None)
     args = finetune.Args(landmarks=CELLS, random_episodes=2, patience=2)
-    best, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
+    best, n_episodes = finetune.finetune(args, untrained(), problem)
     assert (best.cover_time, n_episodes) == (longer[3].cover_time, 7)
 
 
 def test_without_a_solution_all_episodes_are_played(monkeypatch):
     """However long it waits in vain; the first shows the policy, then as many as said explore."""
-    played, run_episode = [], finetune.run_episode
+    played, run_episode = [], finetune.Tuner.run_episode
 
-    def noted(env, tuner, random):
+    def noted(tuner, env, random):
         played.append(random)
-        return run_episode(env, tuner, random)
+        return run_episode(tuner, env, random)
 
-    monkeypatch.setattr(finetune, "run_episode", noted)
+    monkeypatch.setattr(finetune.Tuner, "run_episode", noted)
     short = Setting(GRID, 2, 2, 1)  # no time to come to either landmark
     problem = short.problem(CELLS)
     args = finetune.Args(landmarks=CELLS, episodes=9, random_episodes=3, patience=1, imagined=16)
-    best, n_episodes = finetune.finetune(args, untrained(), short, problem)
+    best, n_episodes = finetune.finetune(args, untrained(), problem)
     assert not best.success
     assert n_episodes == 9
     assert played == [False, *[True] * 3, *[False] * 5]
@@ -158,7 +158,7 @@ def test_what_cannot_be_fine_tuned_is_refused(folder):
     large = NetworkPolicy(build_network(spec, torch_generator(np.random.SeedSequence(0))))
     problem = mapp_env.Problem(GRID, CELLS, 7)
     with pytest.raises(ValueError, match=r"policy must be of a team with at most 1,024 joint"):
-        finetune.finetune(finetune.Args(landmarks=CELLS), large, Setting(GRID, 7, 2, 20), problem)
+        finetune.finetune(finetune.Args(landmarks=CELLS), large, problem)
 
 
 def test_a_policy_of_another_grid_is_not_fine_tuned():
@@ -167,7 +167,7 @@ def test_a_policy_of_another_grid_is_not_fine_tuned():
     policy = NetworkPolicy(untrained().network, other)
     problem = SETTING.problem(CELLS)
     with pytest.raises(ValueError, match=r"policy must be one of this grid, or of any"):
-        finetune.finetune(finetune.Args(landmarks=CELLS), policy, SETTING, problem)
+        finetune.finetune(finetune.Args(landmarks=CELLS), policy, problem)
 
 
 def test_imagined_episodes_are_made_of_experienced_moves():
@@ -182,7 +182,7 @@ def test_imagined_episodes_are_made_of_experienced_moves():
     rng = np.random.default_rng(0)
     env = mapp_v0.parallel_env(GRID, 2, 2, 20)
     for _ in range(3):
-        finetune.run_episode(env, tuner, random=True)
+        tuner.run_episode(env, random=True)
     known = tuner.moves != finetune.UNKNOWN
     np.testing.assert_array_equal(tuner.moves[known], np.asarray(GRID.moves)[:, :4][known])
     for _ in range(20):
@@ -192,7 +192,7 @@ def test_imagined_episodes_are_made_of_experienced_moves():
         if found is None:
             continue
         actions = tuner.digits[found.joint]
-        cells = found.seen[:, :2].astype(int)
+        cells = found.observations[:, :2].astype(int)
         assert (tuner.moves[cells, actions] != finetune.UNKNOWN).all()
         played = replay(problem, actions)
         assert played.success
@@ -228,13 +228,13 @@ def test_patience_begins_after_the_random_episodes(monkeypatch):
     """Only episodes played after training count as waiting, however long the random ones are."""
     problem = SETTING.problem(CELLS)
     optimum = mapp_env.solve(problem)
-    monkeypatch.setattr(finetune, "run_episode", lambda env, tuner, random: optimum)
+    monkeypatch.setattr(finetune.Tuner, "run_episode", lambda tuner, env, random: optimum)
     monkeypatch.setattr(finetune.Tuner, "train", lambda tuner: None)
     for random_episodes, patience in ((0, 1), (2, 1), (5, 3)):
         args = finetune.Args(
             landmarks=CELLS, random_episodes=random_episodes, patience=patience, episodes=20
         )
-        _, n_episodes = finetune.finetune(args, untrained(), SETTING, problem)
+        _, n_episodes = finetune.finetune(args, untrained(), problem)
         assert n_episodes == 1 + random_episodes + patience
 
 
