@@ -23,6 +23,7 @@ import numpy as np
 import tyro
 from tqdm import tqdm  # type: ignore[import-untyped]
 
+from baselines.learning.config import REWARDS
 from baselines.policies.evaluation import EVALUATION_SEED, find_optima, unseen_problems
 from baselines.policies.settings import N_ACTIONS, Setting
 from mapp_env.engine.loops import visit_rows
@@ -31,7 +32,6 @@ from mapp_env.engine.task import make_world
 from mapp_env.grids import find_grid
 from mapp_env.validation import check_choice, check_count, check_number
 
-REWARDS = tuple(reward.name.lower() for reward in Reward)
 MAX_STATES = 2**26  # half a gigabyte of values
 SAME = 1e-9  # values closer than this are a tie
 LEAST_WEIGHT = 10 * SAME  # of the last step of an episode, seen from the first

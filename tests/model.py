@@ -28,6 +28,7 @@ PAPER_ROWS = (
 MOVES = ((0, -1), (0, 1), (-1, 0), (1, 0), (0, 0))
 
 REWARDS = ("manhattan", "geodesic", "step")
+OBSERVATIONS = ("global", "own_first", "planes", "geodesic")
 
 
 def depot_of(rows: Sequence[str]) -> int:

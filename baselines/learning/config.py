@@ -11,9 +11,11 @@ import tyro
 
 from baselines.learning.ranges import Positive, Share, Within, allowed_values, check_options
 from baselines.runs.folder import read_config
+from mapp_env.engine import rules
 from mapp_env.validation import check_choice
 
-Reward = Literal["manhattan", "geodesic", "step"]
+REWARDS = tuple(kind.name.lower() for kind in rules.Reward)
+Reward = Literal[REWARDS]  # type: ignore[valid-type]
 FORMER_NAMES = {"--huber": "--huber-delta", "--sharpness": "--inverse-temperature"}
 TASK = ("n_agents", "n_landmarks", "max_cycles")  # in each run's config, options of it or not
 Units = Annotated[int, Within(1, 4096)]
@@ -144,7 +146,7 @@ class Options(RunOptions):
     target_rate: Share = 0.03
     """how far the target network moves towards the network at each update"""
 
-    final_reward: Literal["manhattan", "geodesic", "step", "same"] = "step"
+    final_reward: Literal[Reward, "same"] = "step"
     """reward that imagined transitions are given towards the end, or the same as before"""
     final_from: Share = 0.2
     """part of the episodes after which that is so"""

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 from model import (
+    OBSERVATIONS,
     PAPER_ROWS,
     REWARDS,
     Case,
@@ -256,7 +257,7 @@ def test_replay_scores_as_the_model(seed: int) -> None:
         assert moves == metrics["total_distance"]
 
 
-@pytest.mark.parametrize("kind", ["global", "own_first", "planes", "geodesic"])
+@pytest.mark.parametrize("kind", OBSERVATIONS)
 @pytest.mark.parametrize("seed", [0, 1, 3, 4, 7, 9, 12, 17, 23, 26, 27, 34])
 def test_observation_kinds_are_the_model(seed: int, kind: str) -> None:
     """Each kind holds what its documentation lists, for every agent, on all three faces.

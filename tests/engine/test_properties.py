@@ -16,7 +16,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from model import PAPER_ROWS, REWARDS, landmark_cells, symmetries, transform
+from model import OBSERVATIONS, PAPER_ROWS, REWARDS, landmark_cells, symmetries, transform
 
 import mapp_env
 from mapp_env import mapp_v0
@@ -24,7 +24,6 @@ from mapp_env.engine.loops import visit_rows
 from mapp_env.engine.rules import Reward
 from mapp_env.engine.task import make_world
 
-KINDS = ("global", "own_first", "planes", "geodesic")
 REPOSITORY = Path(__file__).resolve().parents[2]
 
 
@@ -201,7 +200,7 @@ def test_laws_of_an_episode(game: dict[str, Any]) -> None:
         assert set(metrics.values()) == {False, float("inf")}
 
 
-@given(games(), st.sampled_from(KINDS))
+@given(games(), st.sampled_from(OBSERVATIONS))
 def test_geodesic_reward_bounds_manhattan(game: dict[str, Any], kind: str) -> None:
     """Walls only lengthen ways: the geodesic reward is never above the Manhattan one.
 
@@ -230,7 +229,7 @@ def drive(env: Any, seed: int | None, action_seed: int, episodes: int) -> list[A
     return said
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", OBSERVATIONS)
 def test_twins_and_strangers(kind: str, same: Any) -> None:
     """Equal seeds play bitwise equal episodes, later ones too; another seed another episode."""
 
@@ -340,7 +339,7 @@ def scribble(item: Any) -> int:
     return count
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", OBSERVATIONS)
 @pytest.mark.parametrize("face", ["parallel", "central", *(mode.name for mode in AutoresetMode)])
 def test_returned_arrays_are_the_callers(face: str, kind: str, same: Any) -> None:
     """Writing into anything returned changes nothing later; no two returned arrays share memory."""

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.wrappers import TimeLimit
+from model import OBSERVATIONS
 
 from mapp_env import mapp_v0
 from mapp_env.envs.tuple_env import TupleEnv
 
-KINDS = ("global", "own_first", "planes", "geodesic")
 
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", OBSERVATIONS)
 def test_tuples_play_the_parallel_environment(kind: str, same: Callable[[Any, Any], None]) -> None:
     """Observations, rewards, ends, masks, state and metrics are those of the PettingZoo face."""
     settings: dict[str, Any] = {"n_landmarks": 2, "max_cycles": 30, "observation": kind}

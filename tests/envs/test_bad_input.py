@@ -17,6 +17,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from model import OBSERVATIONS, REWARDS
 
 import mapp_env
 from mapp_env import mapp_v0
@@ -254,12 +255,12 @@ def test_more_landmarks_than_cells() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "allowed"),
     [
-        ("reward", "sparse", ["manhattan", "geodesic", "step"]),
-        ("reward", None, ["manhattan", "geodesic", "step"]),
-        ("reward", 0, ["manhattan", "geodesic", "step"]),
-        ("observation", "pixels", ["global", "own_first", "planes", "geodesic"]),
-        ("observation", ["global"], ["global", "own_first", "planes", "geodesic"]),
-        ("observation", "Global", ["global", "own_first", "planes", "geodesic"]),
+        ("reward", "sparse", REWARDS),
+        ("reward", None, REWARDS),
+        ("reward", 0, REWARDS),
+        ("observation", "pixels", OBSERVATIONS),
+        ("observation", ["global"], OBSERVATIONS),
+        ("observation", "Global", OBSERVATIONS),
         ("render_mode", "video", ["human", "rgb_array", "ansi"]),
         ("render_mode", 1, ["human", "rgb_array", "ansi"]),
         ("allow_wait", "no", ["True", "False"]),

@@ -20,6 +20,7 @@ import numpy as np
 import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import check_env
+from model import OBSERVATIONS
 
 import mapp_env
 from mapp_env import mapp_v0
@@ -31,7 +32,6 @@ with warnings.catch_warnings():  # these import PettingZoo's own environments th
     from pettingzoo.test.render_test import render_test as official_render_test
     from pettingzoo.test.state_test import state_test as official_state_test
 
-KINDS = ("global", "own_first", "planes", "geodesic")
 COUNTS = (1, 3, 7)
 
 over_the_grid = pytest.mark.parametrize(
@@ -41,7 +41,7 @@ over_the_grid = pytest.mark.parametrize(
             {"observation": kind, "n_agents": count, "allow_wait": wait},
             id=f"{kind}-{count}-{'wait' if wait else 'move'}",
         )
-        for kind in KINDS
+        for kind in OBSERVATIONS
         for count in COUNTS
         for wait in (False, True)
     ],

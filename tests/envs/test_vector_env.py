@@ -9,11 +9,10 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from model import landmark_cells
+from model import OBSERVATIONS, landmark_cells
 
 import mapp_env
 
-KINDS = ("global", "own_first", "planes", "geodesic")
 MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
 # Small enough that a random walk ends both ways, and several times in a hundred steps.
@@ -52,7 +51,7 @@ def random_actions(rng: np.random.Generator, venv: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", OBSERVATIONS)
 def test_rows_equal_sync_vector_env(kind: str, mode: AutoresetMode, same: Any) -> None:
     """Observations, rewards, flags and whole infos equal SyncVectorEnv's in every mode.
 

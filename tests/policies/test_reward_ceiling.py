@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from model import REWARDS
 
 from baselines import reward_ceiling
 from baselines.policies.evaluation import find_optima, unseen_problems
@@ -19,7 +20,6 @@ from baselines.reward_ceiling import (
 )
 from mapp_env import Grid, make_grid, mapp_v0
 
-REWARDS = ("manhattan", "geodesic", "step")
 WALLED = Grid.from_text(".#..\nD..#\n.#..")
 
 

@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from model import REWARDS
 
 from baselines.networks import network_spec, split_joint
 from baselines.replay.imagined import UNKNOWN, ImaginedReplay, try_actions
@@ -20,7 +21,6 @@ GRIDS = {
     "rooms": Grid.from_text("....#...\n..#....#\n.#..D.#.\n...##...\n.#......"),
     "hall": Grid.from_text("......\n......\n...D..\n......"),
 }
-REWARDS = ("manhattan", "geodesic", "step")
 
 
 def make_replay(grid: Grid, n_agents: int, n_landmarks: int, **changes: object) -> ImaginedReplay:
