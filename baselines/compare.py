@@ -48,11 +48,7 @@ class Args(StudyArgs):
     """folder of the runs, the tables and the figure"""
     presets: tuple[Literal["default", "paper"], ...] = ("default", "paper")
     """presets to compare under"""
-    learners: tuple[Literal["meta", "independent", "shared"], ...] = (
-        "meta",
-        "independent",
-        "shared",
-    )
+    learners: tuple[Literal[tuple(LEARNERS)], ...] = tuple(LEARNERS)  # type: ignore[valid-type]
     """learners to compare: one network commands all agents, each agent has its own, or all use one
     by themselves"""
     default_updates: int | None = None

@@ -65,6 +65,7 @@ from baselines.learning.q_learning import (
 from baselines.learning.ranges import Share
 from baselines.learning.training import Streams, train_learner
 from baselines.networks import (
+    NETWORKS,
     NetworkSpec,
     build_network,
     greedy_actions,
@@ -86,7 +87,7 @@ ALGORITHM = "independent_dqn"
 class Args(Options):
     """Options of independent learners; those of joint values have no effect."""
 
-    network: Literal["pairs", "paper", "geodesic"] = "pairs"
+    network: Literal[tuple(NETWORKS)] = "pairs"  # type: ignore[valid-type]
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
     landmarks as a set, agents in a fixed order; "geodesic": the agent's own shortest paths, the
     observation of that name, landmarks as a set (baselines/networks/geodesic.py)"""

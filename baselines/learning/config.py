@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import tyro
 
 from baselines.learning.ranges import Positive, Share, Within, allowed_values, check_options
+from baselines.networks import CENTRAL
 from baselines.runs.folder import read_config
 from mapp_env.engine import rules
 from mapp_env.validation import check_choice
@@ -97,7 +98,7 @@ class Options(RunOptions):
     episodes_per_problem: Annotated[int, Within(1, 1_000_000)] = 30
     """consecutive episodes on each problem"""
 
-    network: Literal["pairs", "paper"] = "pairs"
+    network: Literal[CENTRAL] = "pairs"  # type: ignore[valid-type]
     """"paper": two layers of hidden units on the plain numbers; "pairs": cells as categories,
     landmarks as a set, agents exchangeable (baselines/networks/pairs.py)"""
     outputs: Literal["joint", "agents"] = "joint"

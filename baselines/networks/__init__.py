@@ -23,6 +23,7 @@ from mapp_env.validation import check_choice
 
 __all__ = [
     "ANY",
+    "CENTRAL",
     "MAX_JOINT_ACTIONS",
     "NETWORKS",
     "Network",
@@ -44,6 +45,8 @@ NETWORKS: dict[str, type[Network]] = {
     "pairs": PairsNetwork,
     "geodesic": GeodesicNetwork,
 }
+CENTRAL = tuple(kind for kind, network in NETWORKS.items() if network.spec_type.commands_all)
+"""Those that may be the one network of all agents."""
 
 
 def network_spec(kind: str, *sizes: Any, **options: Any) -> NetworkSpec:

@@ -26,6 +26,7 @@ class NetworkSpec:
 
     kind: ClassVar[str]  # the network's name, its key in NETWORKS
     any_size: ClassVar[tuple[str, ...]] = ()  # n_cells, n_agents, n_landmarks that may be ANY
+    commands_all: ClassVar[bool] = True  # whether it may be the one network of all agents
     own_cell_first: ClassVar[bool] = True  # for the one network that all agents of a team share
 
     n_agents: int
@@ -48,7 +49,7 @@ class NetworkSpec:
         check_count("hidden_units", self.hidden_units, 1, 4096)
         check_choice("outputs", self.outputs, OUTPUTS)
         check_flag("dueling", self.dueling)
-        check_choice("team", self.team, TEAMS)
+        check_choice("team", self.team, TEAMS if self.commands_all else TEAMS[1:])
         if self.team != "one":
             check_choice("outputs", self.outputs, ("agents",))
         if self.outputs == "joint" and self.n_joint_actions > MAX_JOINT_ACTIONS:

@@ -14,7 +14,7 @@ from mapp_env.engine.loops import observe_rows
 from mapp_env.engine.observation import N_FEATURES, Observation
 from mapp_env.engine.task import make_world
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
-from mapp_env.validation import check_choice, check_count
+from mapp_env.validation import check_count
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class GeodesicSpec(NetworkSpec):
     """What all networks have, and the map."""
 
     kind: ClassVar[str] = "geodesic"
+    commands_all: ClassVar[bool] = False
     own_cell_first: ClassVar[bool] = False
 
     code_units: int = 64  # numbers that describe an agent among the landmarks
@@ -30,7 +31,6 @@ class GeodesicSpec(NetworkSpec):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count("code_units", self.code_units, 1, 4096)
-        check_choice("team", self.team, ("independent", "shared"))
         check_count("n_cells", self.n_cells, 2, MAX_ALL_PAIRS_CELLS)
         try:
             super().check_grid(Grid.from_text(self.grid))
