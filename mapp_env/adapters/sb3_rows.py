@@ -38,7 +38,7 @@ class RowsVecEnv(VecEnv):
         self._batch, self._name = batch, name
         self._actions: Any = None
         self._seed: int | None = None  # of the next reset, and its options
-        self._wishes: dict[str, Any] | None = None
+        self._next_options: dict[str, Any] | None = None
         self._masks: NDArray[Any] | None = None  # (B, ...), once there are episodes
         super().__init__(batch.num_envs, observation_space, action_space)
         # For recorders of films, which take 30 a second where nothing is said.

@@ -94,7 +94,7 @@ class SharedVecEnv(RowsVecEnv):
             raise ValueError(
                 f"options must be one dict for all environments, got {describe(options)}"
             )
-        self._wishes = None if options is None else deepcopy(dict(options))
+        self._next_options = None if options is None else deepcopy(dict(options))
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every environment; return the observations, shape (B, ...).
@@ -106,8 +106,8 @@ class SharedVecEnv(RowsVecEnv):
         """
         # SuperSuit gives infos as a list, where Gymnasium has a dict of arrays.
         found: Any
-        observations, found = self.venv.reset(seed=self._seed, options=self._wishes)
-        self._seed, self._wishes = None, None
+        observations, found = self.venv.reset(seed=self._seed, options=self._next_options)
+        self._seed, self._next_options = None, None
         self.reset_infos = list(found)
         self._keep_masks(found)
         return np.array(observations)

@@ -28,7 +28,7 @@ class MappSb3VecEnv(RowsVecEnv):
 
     A row that ends starts its next episode in the same step. Its info holds
 
-    - ``terminal_observation``: what was seen last;
+    - ``terminal_observation``: the last observation;
     - ``TimeLimit.truncated``: whether the step limit ended it, so that its value is bootstrapped;
     - ``is_success``: whether all landmarks were visited, for the logged success rate;
     - ``metrics``: success, cover_time, makespan and total_distance;
@@ -123,11 +123,11 @@ class MappSb3VecEnv(RowsVecEnv):
         if options is None or isinstance(options, Mapping):
             if options is not None and "reset_mask" in options:
                 raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
-            self._wishes = None if options is None else deepcopy(dict(options))
+            self._next_options = None if options is None else deepcopy(dict(options))
             return
         cells = np.array(self._landmarks_by_row(options))
         # As pairs: two rows of two cells could as well be two pairs.
-        self._wishes = {"landmarks": pairs_of(self.engine.task.grid, cells)}
+        self._next_options = {"landmarks": pairs_of(self.engine.task.grid, cells)}
 
     def _landmarks_by_row(self, options: Any) -> list[tuple[int, ...]]:
         """Return the landmarks of a list of options, one a row."""
@@ -137,13 +137,13 @@ class MappSb3VecEnv(RowsVecEnv):
                 f"a row, got {describe(options)}"
             )
         found = []
-        for row, wishes in enumerate(options):
-            if not isinstance(wishes, Mapping) or set(wishes) != {"landmarks"}:
+        for row, wanted in enumerate(options):
+            if not isinstance(wanted, Mapping) or set(wanted) != {"landmarks"}:
                 raise ValueError(
-                    f"options[{row}] must be a dict with 'landmarks' alone, got {describe(wishes)}"
+                    f"options[{row}] must be a dict with 'landmarks' alone, got {describe(wanted)}"
                 )
             try:
-                problem = check_options(self.engine.task, dict(wishes))
+                problem = check_options(self.engine.task, dict(wanted))
             except ValueError as error:
                 raise ValueError(f"options[{row}]: {error}") from error
             if problem is None:
@@ -159,9 +159,9 @@ class MappSb3VecEnv(RowsVecEnv):
         ValueError
             If the options cannot be used.
         """
-        observations, infos = self.engine.reset(seed=self._seed, options=self._wishes)
+        observations, infos = self.engine.reset(seed=self._seed, options=self._next_options)
         self._masks = infos["action_mask"]
-        self._seed, self._wishes = None, None
+        self._seed, self._next_options = None, None
         self._returns[:] = 0.0
         self._lengths[:] = 0
         return observations

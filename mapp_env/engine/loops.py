@@ -38,7 +38,7 @@ def step_and_observe(
     masks: NDArray[np.int8],
     world: Packed,
 ) -> tuple[float, bool, bool]:
-    """Step a single row and look at it; parameters as in ``step_row`` and ``observe_row``.
+    """Step a single row and observe it; parameters as in ``step_row`` and ``observe_row``.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def step_rows(
     masks: NDArray[np.int8],
     world: Packed,
 ) -> None:
-    """Step all rows but those of ``skip``, with actions that have been looked at; look at all.
+    """Step all rows but those of ``skip``, with checked actions; observe all.
 
     Shapes: (B, ...) of what ``step_row`` and ``observe_row`` take.
     """
@@ -96,7 +96,7 @@ def observe_rows(
     masks: NDArray[np.int8],
     world: Packed,
 ) -> None:
-    """Look at the rows of ``indices``, (M,): theirs in ``views`` (B, V, F), ``masks`` (B, N, A)."""
+    """Observe the rows of ``indices``, (M,): theirs in ``views`` (B, V, F), ``masks`` (B, N, A)."""
     common = World(*world)
     for index in indices:
         observe_row(rows[index], world_at(common, index), views[index], masks[index])
@@ -230,7 +230,7 @@ def fill_joint_masks(masks: NDArray[np.int8], joint: NDArray[np.int8]) -> None:
 def find_bad_action(actions: NDArray[np.uint64], n_actions: int) -> int:
     """Return the position of the first action outside ``0..n_actions - 1``, or -1.
 
-    Shape: ``actions`` (M,), int64 seen as uint64, so that a negative action is a huge one.
+    Shape: ``actions`` (M,), int64 read as uint64, so that a negative action is a huge one.
     """
     limit = np.uint64(n_actions)
     highest = np.uint64(0)

@@ -64,7 +64,7 @@ class Rows:
         n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
         self._fields = np.empty((n_fields, task.grid.n_cells), np.int32)
         self._every_row = np.arange(n_rows)
-        self._looked_at: NDArray[np.int64] | None = None
+        self._checked: NDArray[np.int64] | None = None
         # Pictures show where agents have been: their cells at each step, for each row.
         self._trails: list[deque[tuple[int, ...]]] | None = None
         if task.render_mode is not None:
@@ -109,10 +109,10 @@ class Rows:
     def find_bad_action(self, actions: NDArray[np.int64]) -> int:
         """Return the position of the first action, shape (B, N), that is none, or -1.
 
-        If there is none, :meth:`step` will not look at the same array again.
+        If there is none, :meth:`step` does not check the same array again.
         """
         position: int = find_bad_action(actions.reshape(-1).view(np.uint64), self.task.n_actions)
-        self._looked_at = actions if position < 0 else None
+        self._checked = actions if position < 0 else None
         return position
 
     def step(
@@ -124,7 +124,7 @@ class Rows:
         NDArray[np.float32],
         NDArray[np.int8],
     ]:
-        """Carry out a valid joint action in each row but those to skip, and look at all.
+        """Carry out a valid joint action in each row but those to skip, and observe all.
 
         Parameters
         ----------
@@ -146,14 +146,14 @@ class Rows:
             If an action is not valid; nothing has moved then. The rules index a table with actions:
             what no face has stopped would leave its memory.
         """
-        if actions is not self._looked_at and (
+        if actions is not self._checked and (
             actions.shape != (self.n_rows, self.task.n_agents) or self.find_bad_action(actions) >= 0
         ):
             raise ValueError(
                 f"actions must be in 0..{self.task.n_actions - 1}, one for each of "
                 f"{self.task.n_agents} agents in each of {self.n_rows} rows"
             )
-        self._looked_at = None
+        self._checked = None
         rewards = np.empty(self.n_rows)
         terminations = np.empty(self.n_rows, np.bool_)
         truncations = np.empty(self.n_rows, np.bool_)

@@ -62,8 +62,8 @@ class Simulation:
         """Start an episode on ``problem``, or on one drawn with a single word of ``np_random``."""
         self._limit = self.max_cycles
         if problem is None:
-            word = np_random.integers(2**64, size=1, dtype=np.uint64)
-            landmarks = draw_problems(self.task, word)
+            word = np_random.integers(2**64, dtype=np.uint64)
+            landmarks = draw_problems(self.task, np.array([word], np.uint64))
         else:
             if problem.max_cycles is not None:
                 self._limit = problem.max_cycles

@@ -40,7 +40,7 @@ def check_options(task: Task, options: Mapping[str, Any] | None) -> Problem | No
     Raises
     ------
     ValueError
-        If the wish cannot be met.
+        If the options are invalid.
     """
     if options is None:
         return None
@@ -72,7 +72,7 @@ def check_reset_mask(options: Mapping[str, Any] | None, n_rows: int) -> NDArray[
     Raises
     ------
     ValueError
-        If the options are no dict, or their mask is none.
+        If the options are not a dict, or their mask is invalid.
     """
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"options must be a dict or None, got {describe(options)}")
@@ -98,7 +98,7 @@ def check_problems(
     Raises
     ------
     ValueError
-        If they are none of the task's.
+        If the options are invalid, or their problem is not of the task's grid and sizes.
     """
     landmarks = None if options is None else options.get("landmarks")
     if isinstance(landmarks, np.ndarray) and landmarks.ndim > 1:

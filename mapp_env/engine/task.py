@@ -200,7 +200,7 @@ def make_world(
     reward : Reward
         The team reward.
     observation : Observation
-        What is seen.
+        The observation kind.
     fields : ndarray of int32, shape (B * K, C), or empty
         Where shortest paths from the rows' landmarks will stand; empty: those of all pairs do.
 

@@ -156,8 +156,9 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
         names = self._names
         if terminated or truncated:
             self.agents = []
+            metrics = simulation.metrics()
             for info in infos.values():
-                info["metrics"] = simulation.metrics()
+                info["metrics"] = metrics.copy()
         if self.render_mode == "human":
             self.render()
         return (
