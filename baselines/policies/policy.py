@@ -138,9 +138,10 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> NetworkPol
     try:
         network.to(device)
     except (RuntimeError, AssertionError) as error:  # unknown to PyTorch, or not on this machine
+        reason = str(error).partition("\n")[0]
         raise ValueError(
-            f"device must be one that PyTorch has here, got {device!r}: {error}"
-        ) from (error)
+            f"device must be one that PyTorch has here, got {device!r}: {reason}"
+        ) from error
     return NetworkPolicy(network.eval(), grid)
 
 
