@@ -66,10 +66,7 @@ class Args(StudyArgs):
 def main(args: Args, words: Sequence[str] = ()) -> int:
     """Train and add up; return the exit code.
 
-    Raises
-    ------
-    ValueError
-        If an option is refused, or a training has failed.
+    Raises a ValueError if an option is refused, or a training has failed.
     """
     return run_study(args, words, "ablation", ("variant",))[0]
 

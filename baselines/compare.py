@@ -79,10 +79,7 @@ class Args(StudyArgs):
 def main(args: Args, words: Sequence[str] = (), train: Train | None = None) -> int:
     """Train, compare, draw; return the exit code.
 
-    Raises
-    ------
-    ValueError
-        If an option is refused, or a training has failed.
+    Raises a ValueError if an option is refused, or a training has failed.
     """
     code, summaries = run_study(args, words, "comparison", COLUMNS, train)
     if code == 0:

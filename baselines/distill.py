@@ -153,10 +153,7 @@ class Distilled(Imitation):
 def main(args: Args) -> int:
     """Train and evaluate; return the exit code.
 
-    Raises
-    ------
-    ValueError
-        If an option, the policy or the folder cannot be used.
+    Raises a ValueError if an option, the policy or the folder cannot be used.
     """
     args = own_options(args, ALGORITHM)
     if args.resume is None:

@@ -57,11 +57,8 @@ class Args:
 def export(policy: str) -> str:
     """Return the script that holds a policy's weights.
 
-    Raises
-    ------
-    ValueError
-        If there is no such policy, or the page cannot run it: it is of another setting or kind,
-        or has weights that 16 bits have no room for.
+    Raises a ValueError if there is no such policy, or the page cannot run it: it is of another
+    setting or kind, or has weights that 16 bits have no room for.
     """
     run = load_run(policy)
     check_runs(policy, run)
@@ -102,11 +99,8 @@ def _lines(value: object) -> str:
 def check_runs(policy: str, run: PolicyOfRun) -> None:
     """Refuse a policy of another task than the page shows, or a network that it has no code for.
 
-    Raises
-    ------
-    ValueError
-        If grid, number of agents, landmarks or step limit differ from the default setting's; or
-        if it is not one network of kind "pairs" for all agents, with joint outputs.
+    Raises a ValueError if grid, number of agents, landmarks or step limit differ from the default
+    setting's; or if it is not one network of kind "pairs" for all agents, with joint outputs.
     """
     shown = Setting(make_grid())
     if run.setting.grid != shown.grid:

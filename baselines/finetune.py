@@ -205,10 +205,7 @@ def finetune(args: Args, policy: NetworkPolicy, problem: Problem) -> tuple[Plan,
 
     It ends early when nothing has become better for a while.
 
-    Raises
-    ------
-    ValueError
-        If the policy is of another grid than the problem, or of too large a team.
+    Raises a ValueError if the policy is of another grid than the problem, or of too large a team.
     """
     check_grid(policy, problem.grid)
     tuner = Tuner(args, policy.network, problem)
@@ -234,10 +231,7 @@ def finetune(args: Args, policy: NetworkPolicy, problem: Problem) -> tuple[Plan,
 def tune_many(args: Args, run: PolicyOfRun) -> None:
     """Fine-tune on random problems that the policy does not solve optimally, and count.
 
-    Raises
-    ------
-    ValueError
-        If the optimum of so many landmarks is not known.
+    Raises a ValueError if the optimum of so many landmarks is not known.
     """
     policy, setting, known = run
     n_problems = min(100 * args.problems, count_unseen(setting, known))

@@ -269,10 +269,7 @@ def scale_outputs(network: Network, factor: float) -> None:
 def main(args: Args) -> int:
     """Improve and evaluate; return the exit code.
 
-    Raises
-    ------
-    ValueError
-        If no policy is named, or it cannot be improved.
+    Raises a ValueError if no policy is named, or it cannot be improved.
     """
     args = own_options(args, ALGORITHM)
     start = start_of(args.resume, args.policy)

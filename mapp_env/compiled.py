@@ -17,8 +17,6 @@ from numba import config, njit
 from numba.core import event
 from numba.core.caching import FunctionCache
 
-__all__ = ["cache_files", "cache_folders", "clock", "is_compiled", "kernel", "nogil_kernel"]
-
 
 def _digest_sources() -> str:
     """Return a name for the present state of the package's sources, in a folder or a zip."""

@@ -15,18 +15,6 @@ from typing import Any
 
 from mapp_env.validation import describe
 
-__all__ = [
-    "FileError",
-    "check_writable",
-    "make_folder",
-    "parse_json",
-    "read_bytes",
-    "read_json",
-    "remove_unfinished",
-    "write_bytes",
-    "write_text",
-]
-
 MAX_PATH_LETTERS = 320  # of a path in a message
 MAX_LINKS = 40  # as Linux follows at most
 STREAMS = ("/proc/", "/dev/fd/")  # where a process finds the files it has open
@@ -48,10 +36,8 @@ def read_bytes(
     Nothing is read before the file is known to be regular, so that a pipe or a device cannot
     block. Messages call such a file ``what``: "a map file".
 
-    Raises
-    ------
-    ValueError
-        As ``error_type``, if the file cannot be opened, is not regular or is too large.
+    Raises a ValueError as ``error_type``, if the file cannot be opened, is not regular or is too
+    large.
     """
     if not isinstance(path, str | os.PathLike):
         raise error_type(f"path must be a str or os.PathLike, got {describe(path)}")
@@ -104,10 +90,7 @@ def parse_json(data: str | bytes, where: object, error_type: type[ValueError] = 
     Numbers are finite, and no object has a key twice: two readers could differ on it. How large
     the text may be is for the caller to say; messages call it ``where``.
 
-    Raises
-    ------
-    ValueError
-        As ``error_type``, if it is not strict JSON or nested too deeply.
+    Raises a ValueError as ``error_type``, if it is not strict JSON or nested too deeply.
     """
     try:
         return json.loads(
@@ -158,11 +141,8 @@ def write_bytes(path: str | os.PathLike[str], data: bytes, limit: int) -> None:
     a link, what it leads to is replaced; another name of the same file (a hard link) keeps the old
     content.
 
-    Raises
-    ------
-    FileError
-        If there are more than ``limit`` bytes or the file cannot be written; an earlier file is
-        left as it was.
+    Raises a FileError if there are more than ``limit`` bytes or the file cannot be written; an
+    earlier file is left as it was.
     """
     target = check_writable(path)
     if len(data) > limit:
@@ -178,11 +158,8 @@ def check_writable(path: str | os.PathLike[str]) -> str:
 
     For what takes long to make, so that a slip of the pen is noticed before.
 
-    Raises
-    ------
-    FileError
-        If it is no path, its folder is not there, or there is something already that is no file or
-        may not be written.
+    Raises a FileError if it is no path, its folder is not there, or there is something already that
+    is no file or may not be written.
     """
     if not isinstance(path, str | os.PathLike):
         raise FileError(f"path must be a str or os.PathLike, got {describe(path)}")
@@ -252,10 +229,7 @@ def _replace(target: str, data: bytes) -> None:
 def make_folder(path: str | os.PathLike[str]) -> None:
     """Make a folder and those above it, if they are not there, and force their names to the disk.
 
-    Raises
-    ------
-    OSError
-        If one cannot be made.
+    Raises an OSError if one cannot be made.
     """
     folder = pathlib.Path(path)
     new = [place for place in (folder, *folder.parents) if not place.exists()]

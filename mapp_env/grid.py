@@ -16,8 +16,6 @@ from mapp_env.compiled import kernel
 from mapp_env.map_format import MAX_SIDE, MapError, ParsedMap, parse_map, read_map
 from mapp_env.validation import as_array, as_integer, describe
 
-__all__ = ["FAR", "MAX_ALL_PAIRS_CELLS", "Grid"]
-
 MAX_ALL_PAIRS_CELLS = 4096
 """Largest number of cells for which all pairs of distances are kept (64 MiB at 4096)."""
 

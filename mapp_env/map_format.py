@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from mapp_env.files import read_bytes
 from mapp_env.validation import describe
 
-__all__ = ["MAX_FILE_BYTES", "MAX_SIDE", "MapError", "ParsedMap", "parse_map", "read_map"]
-
 MAX_SIDE = 512
 """Largest number of rows or columns of a grid."""
 
@@ -46,10 +44,8 @@ class ParsedMap(NamedTuple):
 def read_map(source: str) -> ParsedMap:
     """Read a map file of at most ``MAX_FILE_BYTES`` bytes.
 
-    Raises
-    ------
-    MapError
-        If the file cannot be opened, is not a regular file, is too large or is malformed.
+    Raises a MapError if the file cannot be opened, is not a regular file, is too large or is
+    malformed.
     """
     data = read_bytes(source, MAX_FILE_BYTES, "a map file", MapError)
     data = data.removeprefix(codecs.BOM_UTF8)  # as editors of some systems write it

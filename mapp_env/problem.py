@@ -18,16 +18,6 @@ from mapp_env.grid import Grid
 from mapp_env.records import MAX_PROBLEM_BYTES, Record, read_record, write_record
 from mapp_env.validation import check_count, describe
 
-__all__ = [
-    "MAX_AGENTS",
-    "MAX_CYCLES",
-    "MAX_LANDMARKS",
-    "Problem",
-    "check_grid",
-    "check_landmarks",
-    "sample_problems",
-]
-
 MAX_AGENTS = 16
 MAX_LANDMARKS = 256
 MAX_CYCLES = 1_000_000

@@ -14,15 +14,6 @@ from typing import Any
 from mapp_env.files import FileError, read_json, write_text
 from mapp_env.validation import describe
 
-__all__ = [
-    "MAX_PLAN_BYTES",
-    "MAX_PROBLEM_BYTES",
-    "Record",
-    "labelled",
-    "read_record",
-    "write_record",
-]
-
 VERSION = 1
 
 MAX_PROBLEM_BYTES = 1 << 20
@@ -151,10 +142,8 @@ def read_record(path: str | os.PathLike[str], kind: str, limit: int) -> Record:
 
     All but ``format`` and ``version``, which are checked.
 
-    Raises
-    ------
-    FileError
-        If the file cannot be read, is not strict JSON, or is of another kind or version.
+    Raises a FileError if the file cannot be read, is not strict JSON, or is of another kind or
+    version.
     """
     value = read_json(path, limit, f"a {kind} file", max_marks=MAX_MARKS)
     where = os.fspath(path)
@@ -173,10 +162,7 @@ def write_record(
 ) -> None:
     """Write one JSON object, one field a line, as :func:`read_record` reads it.
 
-    Raises
-    ------
-    FileError
-        If it would be larger than ``limit`` bytes, or cannot be written.
+    Raises a FileError if it would be larger than ``limit`` bytes, or cannot be written.
     """
     lines = [
         f" {json.dumps(name)}: {json.dumps(value, allow_nan=False)}"

@@ -11,18 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "MAX_SEED",
-    "as_array",
-    "as_integer",
-    "as_real",
-    "check_choice",
-    "check_count",
-    "check_flag",
-    "check_number",
-    "describe",
-]
-
 MAX_SEED = 2**128 - 1
 
 # Looks at the first few items alone: a refusal should not take as long as printing a whole list.
@@ -80,10 +68,8 @@ def as_real(value: object) -> float | None:
 def check_count(name: str, value: object, low: int, high: int) -> int:
     """Return ``value`` as an ``int`` between ``low`` and ``high``, both included.
 
-    Raises
-    ------
-    ValueError
-        If ``value`` is not an integer (booleans and floats are not) or out of range.
+    Raises a ValueError if ``value`` is not an integer (booleans and floats are not) or out of
+    range.
     """
     number = as_integer(value)
     if number is None or not low <= number <= high:
@@ -94,10 +80,7 @@ def check_count(name: str, value: object, low: int, high: int) -> int:
 def check_choice(name: str, value: object, allowed: Iterable[str | None]) -> Any:
     """Return ``value`` if it is one of ``allowed``.
 
-    Raises
-    ------
-    ValueError
-        If it is not; the message lists what is allowed.
+    Raises a ValueError if it is not; the message lists what is allowed.
     """
     options: Sequence[str | None] = tuple(allowed)
     if (value is None or isinstance(value, str)) and value in options:
@@ -109,10 +92,7 @@ def check_choice(name: str, value: object, allowed: Iterable[str | None]) -> Any
 def check_flag(name: str, value: object) -> bool:
     """Return ``value`` if it is ``True`` or ``False``.
 
-    Raises
-    ------
-    ValueError
-        If ``value`` is anything else, numbers included.
+    Raises a ValueError if ``value`` is anything else, numbers included.
     """
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} must be True or False, got {describe(value)}")
@@ -122,10 +102,7 @@ def check_flag(name: str, value: object) -> bool:
 def check_number(name: str, value: object, low: float, high: float) -> float:
     """Return ``value`` as a ``float`` between ``low`` and ``high``, both included.
 
-    Raises
-    ------
-    ValueError
-        If ``value`` is not a finite number (a boolean is not) or out of range.
+    Raises a ValueError if ``value`` is not a finite number (a boolean is not) or out of range.
     """
     number = as_real(value)
     if number is None or not low <= number <= high:

@@ -312,11 +312,8 @@ def option_name(word: str) -> str:
 def own_options(args: Chosen, algorithm: str) -> Chosen:
     """Return a run's options: if it is resumed, those it was started with.
 
-    Raises
-    ------
-    ValueError
-        If others are given beside ``resume``, or the folder holds no run of this algorithm and
-        version.
+    Raises a ValueError if others are given beside ``resume``, or the folder holds no run of this
+    algorithm and version.
     """
     folder, kind = args.resume, type(args)
     if folder is None:

@@ -21,10 +21,7 @@ def restore_optimiser(
 ) -> None:
     """Take over what :func:`optimiser_arrays` returned after a number of steps.
 
-    Raises
-    ------
-    ValueError
-        If it is not there of each weight, or after another number of steps.
+    Raises a ValueError if it is not there of each weight, or after another number of steps.
     """
     content = optimiser.state_dict()
     content["state"] = {}

@@ -34,11 +34,8 @@ class Goal(NamedTuple):
 def make_goals(args: Options, grid: Grid) -> tuple[Goal, Goal]:
     """Return what is aimed at to begin with, and later.
 
-    Raises
-    ------
-    ValueError
-        If transitions are relabelled, and the grid has too many cells for a table of distances
-        between all of them.
+    Raises a ValueError if transitions are relabelled, and the grid has too many cells for a table
+    of distances between all of them.
     """
     sizes = grid, args.n_agents, args.n_landmarks
     if args.replay == "stored":  # with its rewards: none is ever asked for

@@ -118,10 +118,7 @@ class Run(NamedTuple):
     def check_folder(self) -> None:
         """Refuse what was trained with other options, and what is no training.
 
-        Raises
-        ------
-        ValueError
-            If its folder holds anything else.
+        Raises a ValueError if its folder holds anything else.
         """
         folder = self.folder
         if not folder.is_dir():
@@ -159,10 +156,7 @@ def plan_run(
 ) -> Run:
     """Return a run: a learner's script, its `own` words of a command line, those for all runs.
 
-    Raises
-    ------
-    ValueError
-        If an option is refused, or its folder holds a training with other options.
+    Raises a ValueError if an option is refused, or its folder holds a training with other options.
     """
     set_here = {*OWN_OPTIONS, *map(option_name, own)}
     for word in words:
@@ -207,10 +201,8 @@ class StudyArgs(ABC):
     def plan(self, words: Sequence[str]) -> list[Run]:
         """Return all runs, those of one seed together; `words` are options for each of them.
 
-        Raises
-        ------
-        ValueError
-            If a learner does not take an option, or a folder holds a training with other options.
+        Raises a ValueError if a learner does not take an option, or a folder holds a training with
+        other options.
         """
         return [
             plan_run(group, seed, self.out, script, own, words)
@@ -222,10 +214,7 @@ class StudyArgs(ABC):
 def check_distinct(name: str, values: Sequence[str]) -> None:
     """Refuse a choice of nothing, or of one thing twice.
 
-    Raises
-    ------
-    ValueError
-        With the option's name.
+    Raises a ValueError with the option's name.
     """
     if not values or len(set(values)) < len(values):
         raise ValueError(f"{name} must be one or more, none twice, got {values!r}")

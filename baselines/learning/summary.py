@@ -46,10 +46,7 @@ MEASURES = {
 def read_outcome(group: tuple[str, ...], folder: Path, max_cycles: int) -> Outcome:
     """Read what came out of a run of a group, with a step limit.
 
-    Raises
-    ------
-    ValueError
-        If a file of it cannot be read.
+    Raises a ValueError if a file of it cannot be read.
     """
     path = folder / EVALUATION_FILE
     text = read_bytes(path, MAX_TABLE_BYTES, "a table", ValueError).decode(errors="replace")

@@ -304,10 +304,7 @@ def train_learner(
 ) -> int:
     """Train a learner, evaluate, draw; return the exit code.
 
-    Raises
-    ------
-    ValueError
-        If an option or the folder cannot be used.
+    Raises a ValueError if an option or the folder cannot be used.
     """
     args = own_options(args, algorithm)
     if args.resume is None:

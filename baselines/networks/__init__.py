@@ -66,10 +66,7 @@ def network_spec(kind: str, *sizes: Any, **options: Any) -> NetworkSpec:
 def spec_from_options(options: object, kind: str, grid: Grid, **changes: Any) -> NetworkSpec:
     """Return the spec of a kind of network for a grid; a field is the option of its name.
 
-    Raises
-    ------
-    ValueError
-        If there is no such kind, or one of its fields is invalid.
+    Raises a ValueError if there is no such kind, or one of its fields is invalid.
     """
     check_choice("kind", kind, tuple(NETWORKS))
     values = {**vars(options), "n_actions": 4, "n_cells": grid.n_cells, "grid": grid.to_text()}
@@ -81,10 +78,7 @@ def spec_from_options(options: object, kind: str, grid: Grid, **changes: Any) ->
 def build_network(spec: NetworkSpec, generator: torch.Generator | None = None) -> Network:
     """Build the network a spec describes; its initial weights come from `generator`.
 
-    Raises
-    ------
-    ValueError
-        If it would have too many weights: before any memory is allocated for them.
+    Raises a ValueError if it would have too many weights: before any memory is allocated for them.
     """
     try:
         with torch.device("meta"):  # shapes without numbers

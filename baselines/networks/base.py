@@ -93,10 +93,7 @@ class NetworkSpec:
     def check_grid(self, grid: Grid | None) -> None:
         """Refuse a grid that the network cannot be for; None is any grid.
 
-        Raises
-        ------
-        ValueError
-            If it does not have the network's number of cells.
+        Raises a ValueError if it does not have the network's number of cells.
         """
         if self.n_cells not in (ANY, ANY if grid is None else grid.n_cells):
             found = "any grid" if grid is None else f"one of {grid.n_cells}"

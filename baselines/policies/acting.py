@@ -20,10 +20,7 @@ class Acting(Protocol):
 def check_grid(policy: object, grid: Grid) -> None:
     """Refuse a policy that was trained on another grid; one that names none plays on any.
 
-    Raises
-    ------
-    ValueError
-        If its grid is another, or it is not known which one it is.
+    Raises a ValueError if its grid is another, or it is not known which one it is.
     """
     own = getattr(policy, "grid", None)
     if isinstance(own, Grid) and own != grid:
@@ -36,10 +33,8 @@ def check_grid(policy: object, grid: Grid) -> None:
 def check_rows(observations: object) -> np.ndarray:
     """Return observations as a table of numbers, a row per problem.
 
-    Raises
-    ------
-    ValueError
-        If they are no such table: ragged rows, another number of axes, or no real numbers.
+    Raises a ValueError if they are no such table: ragged rows, another number of axes, or no real
+    numbers.
     """
     try:
         array = np.asarray(observations)
@@ -59,10 +54,8 @@ def check_observations(
 
     With `n_cells` ANY they may come from any grid.
 
-    Raises
-    ------
-    ValueError
-        If the shape is not (B, N + 2K), a cell is none of the grid's, or a flag is not 0 or 1.
+    Raises a ValueError if the shape is not (B, N + 2K), a cell is none of the grid's, or a flag is
+    not 0 or 1.
     """
     array = check_rows(observations)
     if array.shape[1] != n_agents + 2 * n_landmarks:

@@ -62,10 +62,7 @@ def count_unseen(setting: Setting, exclude: Sequence[Sequence[int]]) -> int:
 def every_problem(setting: Setting) -> np.ndarray:
     """Return the universe of a setting, in lexicographic order: (P, K).
 
-    Raises
-    ------
-    ValueError
-        If it is too large to be listed.
+    Raises a ValueError if it is too large to be listed.
     """
     return solve_universe(setting.grid, setting.n_landmarks, setting.n_agents)[0]
 

@@ -29,11 +29,8 @@ LEARNER_COLOURS = ("#123a63", "#d1682c", "#3b8f5a")
 def draw_learning_curves(folder: Path, window: int = 30) -> list[Path]:
     """Draw Fig. 2 and Fig. 3 of a run; `window` episodes go into the running mean.
 
-    Raises
-    ------
-    ValueError
-        If the window is none, or metrics.csv cannot be read, lacks a column that is drawn, or has
-        no finished episode.
+    Raises a ValueError if the window is none, or metrics.csv cannot be read, lacks a column that is
+    drawn, or has no finished episode.
     """
     check_count("window", window, 1, 1_000_000_000)
     metrics = read_metrics(folder)

@@ -92,10 +92,7 @@ def save_policy(
 def header(spec: NetworkSpec, grid: Grid | None) -> dict[str, Any]:
     """Return what a weights file says of its network.
 
-    Raises
-    ------
-    ValueError
-        If the network is for another number of cells than the grid has.
+    Raises a ValueError if the network is for another number of cells than the grid has.
     """
     spec.check_grid(grid)
     text = ANY_GRID if grid is None else grid.to_text()
@@ -148,10 +145,7 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> NetworkPol
 def check_weights(network: Network, weights: dict[str, torch.Tensor]) -> None:
     """Refuse weights that are not, one for one, those that a network has.
 
-    Raises
-    ------
-    ValueError
-        If one is missing, unknown, of another shape or dtype, or not finite.
+    Raises a ValueError if one is missing, unknown, of another shape or dtype, or not finite.
     """
     expected = network.state_dict()
     if weights.keys() != expected.keys():
@@ -181,10 +175,7 @@ def pretrained_names() -> list[str]:
 def find_weights(path: object) -> Path:
     """Return the weights file that is meant by a pretrained policy's name, a run folder or itself.
 
-    Raises
-    ------
-    ValueError
-        If there is none.
+    Raises a ValueError if there is none.
     """
     names = pretrained_names()
     try:
@@ -204,10 +195,8 @@ def find_weights(path: object) -> Path:
 def read_header(content: bytes) -> tuple[NetworkSpec, Grid | None]:
     """Read from the header of a safetensors file which network and grid its weights are for.
 
-    Raises
-    ------
-    ValueError or TypeError
-        If the header is damaged, has an entry twice, or is not one of ours.
+    Raises a ValueError or TypeError if the header is damaged, has an entry twice, or is not one of
+    ours.
     """
     if content.startswith(ZIP):
         raise ValueError(

@@ -11,8 +11,6 @@ from mapp_env.engine.state import N_ACTIONS
 from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, MAX_LANDMARKS
 from mapp_env.validation import check_count
 
-__all__ = ["N_ACTIONS", "PolicyOfRun", "Setting", "check_fits", "load_run", "read_setting"]
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -26,10 +24,7 @@ class Setting:
     def problem(self, landmarks: tuple[int, ...]) -> Problem:
         """Return the problem of some landmarks.
 
-        Raises
-        ------
-        ValueError
-            If there are not as many as in the setting, or one is invalid.
+        Raises a ValueError if there are not as many as in the setting, or one is invalid.
         """
         if len(landmarks) != self.n_landmarks:
             raise ValueError(
@@ -49,10 +44,8 @@ class PolicyOfRun(NamedTuple):
 def load_run(name: str | Path, device: str = "cpu") -> PolicyOfRun:
     """Load a policy and what its run folder says of it.
 
-    Raises
-    ------
-    ValueError
-        If there is no such policy, or its folder does not say what it was trained for.
+    Raises a ValueError if there is no such policy, or its folder does not say what it was trained
+    for.
     """
     policy = load_policy(name, device)
     folder = find_weights(name).parent
@@ -64,10 +57,7 @@ def load_run(name: str | Path, device: str = "cpu") -> PolicyOfRun:
 def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
     """Read from a run folder what was trained: the setting, and the training problems.
 
-    Raises
-    ------
-    ValueError
-        If the run's config does not say it, or says something invalid.
+    Raises a ValueError if the run's config does not say it, or says something invalid.
     """
     config = read_config(folder)
     where = f"{folder / CONFIG_FILE}"
@@ -99,10 +89,7 @@ def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
 def check_fits(policy: NetworkPolicy, setting: Setting, folder: Path) -> None:
     """Refuse a run whose config and weights tell of different tasks.
 
-    Raises
-    ------
-    ValueError
-        If the grid, or the number of agents, landmarks or actions differ.
+    Raises a ValueError if the grid, or the number of agents, landmarks or actions differ.
     """
     spec = policy.spec
     for name, value in {

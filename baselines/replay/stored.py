@@ -83,10 +83,7 @@ class ReplayMemory:
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
         """Draw `batch_size` stored transitions, uniformly and with repetition.
 
-        Raises
-        ------
-        ValueError
-            If nothing is stored yet.
+        Raises a ValueError if nothing is stored yet.
         """
         if len(self) == 0:
             raise ValueError("sample: the replay memory is empty, add a transition first")

@@ -96,10 +96,7 @@ class Checkpoints:
     def save(self, number: int, arrays: Mapping[str, np.ndarray], state: Mapping[str, Any]) -> None:
         """Write a checkpoint, then delete all but the last two.
 
-        Raises
-        ------
-        ValueError
-            If it cannot be written; those written before are as they were.
+        Raises a ValueError if it cannot be written; those written before are as they were.
         """
         make_folder(self.folder)
         content = safetensors.numpy.save(
@@ -129,10 +126,7 @@ class Checkpoints:
     def load(self, number: int) -> Checkpoint:
         """Read a checkpoint.
 
-        Raises
-        ------
-        CheckpointError
-            If a part is missing or changed, or it belongs to another run.
+        Raises a CheckpointError if a part is missing or changed, or it belongs to another run.
         """
         path = self._path(number, "json")
         try:
@@ -161,10 +155,8 @@ class Checkpoints:
     def latest(self) -> tuple[Checkpoint | None, list[str]]:
         """Return the newest checkpoint that is whole, and what is wrong with newer ones.
 
-        Raises
-        ------
-        CheckpointError
-            If there are checkpoints but none of them can be used; the start is no substitute.
+        Raises a CheckpointError if there are checkpoints but none of them can be used; the start is
+        no substitute.
         """
         problems: list[str] = []
         for number in reversed(self.numbers()):
@@ -205,10 +197,7 @@ def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 def take(arrays: dict[str, np.ndarray], name: str, like: np.ndarray) -> np.ndarray:
     """Return a copy of one of the arrays, which must have the shape and type of another.
 
-    Raises
-    ------
-    ValueError
-        If it is not there, or is of another shape or type.
+    Raises a ValueError if it is not there, or is of another shape or type.
     """
     found = arrays.get(name)
     if found is None or found.shape != like.shape or found.dtype != like.dtype:
@@ -218,13 +207,7 @@ def take(arrays: dict[str, np.ndarray], name: str, like: np.ndarray) -> np.ndarr
 
 
 def save(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> None:
-    """Write a checkpoint of a training.
-
-    Raises
-    ------
-    ValueError, OSError
-        If it cannot be written.
-    """
+    """Write a checkpoint of a training; raise ValueError, OSError if it cannot be written."""
     state = {**training.state(), "metrics": run.position()}
     checkpoints.save(training.number, training.arrays(), state)
 
@@ -232,11 +215,8 @@ def save(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> None:
 def go_on(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> bool:
     """Bring a training, at its start, to its newest whole checkpoint; return whether there is one.
 
-    Raises
-    ------
-    ValueError
-        If there are checkpoints but none can be used, they were deleted, something is missing in
-        the newest whole one, or metrics.csv has changed; metrics.csv is as it was then.
+    Raises a ValueError if there are checkpoints but none can be used, they were deleted, something
+    is missing in the newest whole one, or metrics.csv has changed; metrics.csv is as it was then.
     """
     checkpoint, problems = checkpoints.latest()
     for problem in problems:
@@ -267,10 +247,7 @@ def go_on(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> bool
 def check_restored(checkpoint: Checkpoint, training: Resumable) -> None:
     """Compare what a training has taken over with what was saved.
 
-    Raises
-    ------
-    ValueError
-        If the next checkpoint would not hold the same.
+    Raises a ValueError if the next checkpoint would not hold the same.
     """
     state = {**training.state(), "metrics": checkpoint.state["metrics"]}
     saved = _entries(checkpoint)

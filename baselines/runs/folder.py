@@ -164,10 +164,7 @@ class RunFolder:
     def rows_at(self, position: Mapping[str, Any]) -> dict[str, list[float]]:
         """Return what was in metrics.csv when a checkpoint was written, by columns.
 
-        Raises
-        ------
-        ValueError
-            If it has changed since.
+        Raises a ValueError if it has changed since.
         """
         path = self.path(METRICS_FILE)
         content = read_bytes(path, MAX_TEXT_BYTES, "a metrics file", ValueError)
@@ -207,10 +204,7 @@ def foreign_entry(folder: Path) -> str | None:
 def read_config(folder: Path) -> dict[str, Any]:
     """Read a run's config.json.
 
-    Raises
-    ------
-    ValueError
-        If the file is missing, too large, or no object of strict JSON.
+    Raises a ValueError if the file is missing, too large, or no object of strict JSON.
     """
     path = folder / CONFIG_FILE
     config = read_json(path, MAX_TEXT_BYTES, "a config file", ValueError)
@@ -222,10 +216,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 def read_metrics(folder: Path) -> dict[str, list[float]]:
     """Read a run's metrics.csv by columns; an empty field is NaN, a torn last row is left out.
 
-    Raises
-    ------
-    ValueError
-        If the file is missing, too large, or not a table of numbers.
+    Raises a ValueError if the file is missing, too large, or not a table of numbers.
     """
     path = folder / METRICS_FILE
     return parse_metrics(path, read_bytes(path, MAX_TEXT_BYTES, "a metrics file", ValueError))

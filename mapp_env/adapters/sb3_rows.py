@@ -102,10 +102,7 @@ class RowsVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set ``max_cycles``, of all rows; refuse all else, as rows have no other attributes.
 
-        Raises
-        ------
-        ValueError
-            If it is another attribute, no limit, or of some rows only.
+        Raises a ValueError if it is another attribute, no limit, or of some rows only.
         """
         if attr_name != LIMIT:
             raise ValueError(f"{attr_name} cannot be set: rows of .{self._name} have no attributes")
@@ -118,10 +115,7 @@ class RowsVecEnv(VecEnv):
     ) -> list[Any]:
         """Return :meth:`action_masks` by row; refuse all else, as rows have no other methods.
 
-        Raises
-        ------
-        ValueError
-            If ``method_name`` is not ``"action_masks"``.
+        Raises a ValueError if ``method_name`` is not ``"action_masks"``.
         """
         if method_name == MASKS:
             return list(self.action_masks()[list(self._get_indices(indices))])

@@ -22,8 +22,6 @@ from mapp_env import __version__
 from mapp_env.commands.reports import add_json_option, print_report, words
 from mapp_env.compiled import cache_files, cache_folders, is_compiled
 
-__all__ = ["add_arguments", "run", "versions_of"]
-
 PACKAGES = ("numpy", "numba", "gymnasium", "pettingzoo", "pillow")
 EXTRAS = (
     *("matplotlib", "pygame-ce", "pyvrp", "torch", "supersuit", "stable-baselines3"),

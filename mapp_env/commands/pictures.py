@@ -11,8 +11,6 @@ from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
-__all__ = ["DEFAULT_FPS", "PICTURES", "check_file", "picture_writer"]
-
 ANIMATIONS, FIGURES = (".gif",), (".png", ".svg", ".pdf")
 PICTURES = (*ANIMATIONS, *FIGURES)
 DEFAULT_FPS = 4.0
@@ -21,10 +19,7 @@ DEFAULT_FPS = 4.0
 def check_file(option: str, out: str) -> str:
     """Return what a path leads to, if a file could be written there.
 
-    Raises
-    ------
-    ValueError
-        If none could; the message names the option.
+    Raises a ValueError if none could; the message names the option.
     """
     try:
         return check_writable(out)

@@ -23,8 +23,6 @@ from mapp_env.plans.plan import Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
-__all__ = ["DEFAULT_LOADER", "load_policy", "play_policy"]
-
 DEFAULT_LOADER = "baselines.policy:load_policy"
 
 
@@ -110,11 +108,8 @@ def _working_folder_last() -> Iterator[None]:
 def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     """Return what the rules make of a policy's episode.
 
-    Raises
-    ------
-    ValueError
-        If the policy was trained on another grid, cannot play such a problem, or its actions are
-        none.
+    Raises a ValueError if the policy was trained on another grid, cannot play such a problem, or
+    its actions are none.
     """
     with _refusing("--policy cannot play this problem"):
         grid = getattr(policy, "grid", None)  # one that names none plays on any

@@ -11,15 +11,6 @@ from mapp_env.grids import generator_names, grid_names, make_grid
 from mapp_env.problem import Problem, sample_problems
 from mapp_env.validation import check_count, describe
 
-__all__ = [
-    "add_grid_options",
-    "add_problem_options",
-    "grid_of",
-    "problem_of",
-    "refuse_problem_options",
-    "seed_of",
-]
-
 MAX_DRAWN = 2**63 - 1  # of seeds
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
 OPTIONS = (
@@ -83,13 +74,7 @@ def add_problem_options(parser: argparse.ArgumentParser) -> None:
 
 
 def problem_of(arguments: argparse.Namespace) -> Problem:
-    """Return the problem that the options describe.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """Return the problem that the options describe; raise ValueError if there is none."""
     if arguments.problem is not None:
         refuse_problem_options(arguments, "a problem file", but="problem")
         try:
@@ -109,23 +94,14 @@ def problem_of(arguments: argparse.Namespace) -> Problem:
 
 
 def seed_of(arguments: argparse.Namespace) -> int:
-    """Return the seed of all that is drawn but the grid.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
-    """
+    """Return the seed of all that is drawn but the grid; raise ValueError if it is none."""
     return check_count("--seed", 0 if arguments.seed is None else arguments.seed, 0, MAX_DRAWN)
 
 
 def refuse_problem_options(arguments: argparse.Namespace, reason: str, but: str = "") -> None:
     """Refuse options that another source of the problem, named in `but`, leaves without effect.
 
-    Raises
-    ------
-    ValueError
-        If one of them was given.
+    Raises a ValueError if one of them was given.
     """
     for name in OPTIONS:
         if name != but and getattr(arguments, name) is not None:
@@ -133,13 +109,7 @@ def refuse_problem_options(arguments: argparse.Namespace, reason: str, but: str 
 
 
 def grid_of(arguments: argparse.Namespace) -> Grid:
-    """Return the grid that the options describe.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """Return the grid that the options describe; raise ValueError if there is none."""
     name = GRID if arguments.grid is None else arguments.grid
     bundled, generators = grid_names(), generator_names()
     given = {"rows": arguments.rows, "cols": arguments.cols, "seed": arguments.grid_seed}

@@ -42,8 +42,6 @@ from mapp_env.problem import Problem
 from mapp_env.solvers import solve
 from mapp_env.validation import check_count
 
-__all__ = ["add_arguments", "run"]
-
 STEPS = 50
 MAX_STEPS = 1_999  # an animation may have one frame more
 

@@ -11,16 +11,6 @@ from typing import Any
 from mapp_env.plans.plan import OBJECTIVES, Plan, json_costs
 from mapp_env.problem import Problem
 
-__all__ = [
-    "OutputError",
-    "add_json_option",
-    "costs_line",
-    "costs_record",
-    "landmarks_line",
-    "print_report",
-    "words",
-]
-
 
 class OutputError(Exception):
     """What was found out cannot be printed."""
@@ -38,10 +28,7 @@ def print_report(
 ) -> None:
     """Print what a command found out, as the user asked for it.
 
-    Raises
-    ------
-    OutputError
-        If it cannot be written; BrokenPipeError if nobody reads it.
+    Raises an OutputError if it cannot be written; BrokenPipeError if nobody reads it.
     """
     try:
         print(json.dumps(record, allow_nan=False) if arguments.json else "\n".join(lines))

@@ -22,8 +22,6 @@ from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.records import MAX_PLAN_BYTES, labelled, write_record
 from mapp_env.solvers import METHODS, solve
 
-__all__ = ["add_arguments", "run"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""

@@ -23,8 +23,6 @@ from mapp_env.grid import Grid
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.solvers import solve_universe
 
-__all__ = ["add_arguments", "run"]
-
 BAR = 40  # letters of the longest bar
 
 
@@ -51,10 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Solve all problems, and print what their optima are.
 
-    Raises
-    ------
-    ValueError
-        If there is no such universe, or it is too large.
+    Raises a ValueError if there is no such universe, or it is too large.
     """
     grid = grid_of(arguments)
     objectives = OBJECTIVES if arguments.objective is None else (arguments.objective,)

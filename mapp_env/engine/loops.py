@@ -15,19 +15,6 @@ from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
 from mapp_env.engine.state import Packed, World, new_rows, split, split_row, world_at
 from mapp_env.grid import fill_distances
 
-__all__ = [
-    "fill_fields",
-    "fill_joint_mask",
-    "fill_joint_masks",
-    "find_bad_action",
-    "measure_rows",
-    "observe_rows",
-    "reset_rows",
-    "step_and_observe",
-    "step_rows",
-    "visit_rows",
-]
-
 
 @kernel
 def step_and_observe(
@@ -40,11 +27,8 @@ def step_and_observe(
 ) -> tuple[float, bool, bool]:
     """Step a single row and observe it; parameters as in ``step_row`` and ``observe_row``.
 
-    Raises
-    ------
-    ValueError
-        If ``actions`` are not one an agent, each one that it has; nothing has moved then. (The
-        rules index a table with them, and what is no action would leave its memory.)
+    Raises a ValueError if ``actions`` are not one an agent, each one that it has; nothing has moved
+    then. (The rules index a table with them, and what is no action would leave its memory.).
     """
     own = World(*world)
     if actions.shape[0] != own.n_agents:

@@ -46,8 +46,6 @@ from mapp_env.engine.state import (
 )
 from mapp_env.grid import FAR, Grid
 
-__all__ = ["N_FEATURES", "Observation", "View", "observe_row", "view", "view_distances"]
-
 N_PLANES = 6
 N_FEATURES = 4 + N_ACTIONS
 

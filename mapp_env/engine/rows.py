@@ -21,8 +21,6 @@ from mapp_env.engine.state import new_rows, split
 from mapp_env.engine.task import Task
 from mapp_env.problem import MAX_CYCLES
 
-__all__ = ["Rows"]
-
 
 class Rows:
     """The state of B problems of one task.

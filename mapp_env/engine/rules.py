@@ -28,16 +28,6 @@ from mapp_env.engine.state import (
 )
 from mapp_env.grid import FAR, Grid
 
-__all__ = [
-    "Reward",
-    "measure_row",
-    "move_row",
-    "reset_row",
-    "reward_distances",
-    "step_row",
-    "visit_row",
-]
-
 MAX_TABLE_CELLS = (
     256  # largest grid for a table of Manhattan distances: it should stay in the cache
 )

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mapp_env.grid import Grid
 
-__all__ = ["TRAIL_MOVES", "Scene"]
 
 TRAIL_MOVES = 512
 """Moves of a trail that are kept and drawn: the time for a picture should not grow with a run."""

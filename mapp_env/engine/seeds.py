@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
 
-__all__ = ["RowSeeds", "spread_seed"]
-
 WORDS_AHEAD = 64
 """Words fetched from a row's generator at a time: a call for each would dominate a step."""
 
@@ -42,10 +40,7 @@ class RowSeeds:
     def check(self, seed: object) -> int | list[int | None] | None:
         """Return what ``reset(seed=...)`` was given: an int, a seed or ``None`` a row, or ``None``.
 
-        Raises
-        ------
-        ValueError
-            If it is anything else.
+        Raises a ValueError if it is anything else.
         """
         if seed is None:
             return None

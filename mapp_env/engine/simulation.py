@@ -14,8 +14,6 @@ from mapp_env.engine.sources import draw_problems
 from mapp_env.engine.task import Task
 from mapp_env.problem import Problem
 
-__all__ = ["Simulation", "metrics_of"]
-
 FIRST_ROW = np.zeros(1, np.int64)
 VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # to make them of types takes longer
 

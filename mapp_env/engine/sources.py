@@ -13,8 +13,6 @@ from mapp_env.engine.task import Task
 from mapp_env.problem import Problem, check_landmarks, draw_landmarks
 from mapp_env.validation import describe
 
-__all__ = ["check_options", "check_problems", "check_reset_mask", "draw_problems"]
-
 
 def draw_problems(task: Task, words: NDArray[np.uint64]) -> NDArray[np.int32]:
     """Return landmarks on the task's grid, shape (M, K), each row drawn with its random word."""
@@ -37,10 +35,7 @@ def check_options(task: Task, options: Mapping[str, Any] | None) -> Problem | No
     ``"landmarks"`` holds cells or (row, col) pairs, ``"problem"`` a whole problem on the task's
     grid with as many agents and landmarks. Other keys are ignored.
 
-    Raises
-    ------
-    ValueError
-        If the options are invalid.
+    Raises a ValueError if the options are invalid.
     """
     if options is None:
         return None
@@ -69,10 +64,7 @@ def check_options(task: Task, options: Mapping[str, Any] | None) -> Problem | No
 def check_reset_mask(options: Mapping[str, Any] | None, n_rows: int) -> NDArray[np.bool_]:
     """Return which rows of a batch to reset, shape (B,), the caller's array untouched.
 
-    Raises
-    ------
-    ValueError
-        If the options are not a dict, or their mask is invalid.
+    Raises a ValueError if the options are not a dict, or their mask is invalid.
     """
     if options is not None and not isinstance(options, Mapping):
         raise ValueError(f"options must be a dict or None, got {describe(options)}")
@@ -95,10 +87,8 @@ def check_problems(
 
     Both are None if nothing is asked for.
 
-    Raises
-    ------
-    ValueError
-        If the options are invalid, or their problem is not of the task's grid and sizes.
+    Raises a ValueError if the options are invalid, or their problem is not of the task's grid and
+    sizes.
     """
     landmarks = None if options is None else options.get("landmarks")
     if isinstance(landmarks, np.ndarray) and landmarks.ndim > 1:

@@ -18,30 +18,6 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.grid import Grid
 
-__all__ = [
-    "ALL_PAIRS",
-    "BY_COORDINATES",
-    "COL",
-    "HOME",
-    "MASK",
-    "NO_DISTANCES",
-    "N_ACTIONS",
-    "ROW",
-    "WAIT",
-    "WALL",
-    "Packed",
-    "State",
-    "World",
-    "cell_table",
-    "landmark_source",
-    "new_rows",
-    "path_distances",
-    "split",
-    "split_row",
-    "state_length",
-    "world_at",
-]
-
 N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
 WAIT = 4
 ROW, COL, HOME, WALL, MASK = 5, 6, 7, 8, 9  # columns of a table, after the five moves
@@ -152,10 +128,7 @@ def landmark_source(state: State, landmark: int, first_field: int) -> int:
 def path_distances(grid: Grid, fields: NDArray[np.int32]) -> tuple[NDArray[np.int32], int]:
     """Return shortest paths as a world holds them: of all pairs, or the rows' fields if it has any.
 
-    Raises
-    ------
-    ValueError
-        If there are no fields and the grid is too large for all pairs.
+    Raises a ValueError if there are no fields and the grid is too large for all pairs.
     """
     if not fields.size:
         return grid.distances, ALL_PAIRS

@@ -23,8 +23,6 @@ from mapp_env.problem import (
 )
 from mapp_env.validation import check_choice, check_count, check_flag
 
-__all__ = ["RENDER_MODES", "GridLike", "Task", "make_world"]
-
 RENDER_MODES = ("human", "rgb_array", "ansi")
 
 MAX_BYTES = 1 << 30
@@ -53,10 +51,8 @@ class Task:
 
     Their meaning is said once, in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
-    Raises
-    ------
-    ValueError
-        If an argument is invalid, or what they ask for together would not fit in memory.
+    Raises a ValueError if an argument is invalid, or what they ask for together would not fit in
+    memory.
     """
 
     grid: GridLike = GridLike()
@@ -154,11 +150,8 @@ class Task:
     def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
         """Refuse a number of rows whose arrays would not fit in memory.
 
-        Raises
-        ------
-        ValueError
-            If the observations or the joint actions' masks of one step, or the distance fields,
-            take more than 1 GiB.
+        Raises a ValueError if the observations or the joint actions' masks of one step, or the
+        distance fields, take more than 1 GiB.
         """
         views = 1 if self.observation_kind == Observation.GLOBAL else self.n_agents
         size = 4 * n_rows * views * int(np.prod(self.view.shape))

@@ -15,13 +15,6 @@ from mapp_env.envs.arguments import CentralTask, takes
 from mapp_env.envs.face import SimulationEnv
 from mapp_env.validation import as_integer, describe
 
-__all__ = [
-    "MAX_JOINT_AGENTS",
-    "CentralEnv",
-    "central_action_masks",
-    "central_action_space",
-]
-
 MAX_JOINT_AGENTS = 6
 """Largest team whose joint actions are numbered one by one (4**6 = 4096)."""
 

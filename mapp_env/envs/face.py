@@ -19,8 +19,6 @@ from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
 from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
 
-__all__ = ["Face", "SimulationEnv"]
-
 
 class Face:
     """An environment over one simulation.

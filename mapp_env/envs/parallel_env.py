@@ -16,8 +16,6 @@ from mapp_env.envs.arguments import takes
 from mapp_env.envs.face import Face
 from mapp_env.validation import as_integer, describe
 
-__all__ = ["MappParallelEnv"]
-
 AgentID = str
 Infos = dict[AgentID, dict[str, Any]]
 

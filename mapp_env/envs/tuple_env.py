@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from mapp_env.envs.arguments import TupleTask, takes
 from mapp_env.envs.face import SimulationEnv
 
-__all__ = ["TupleEnv"]
-
 Views = tuple[NDArray[np.float32], ...]
 
 

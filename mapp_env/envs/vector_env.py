@@ -26,8 +26,6 @@ from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
 from mapp_env.validation import check_count
 
-__all__ = ["MAX_ENVS", "MappVectorEnv", "make_vec"]
-
 MAX_ENVS = 1 << 20
 
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from mapp_env.engine.loops import fill_joint_masks
 
-__all__ = ["Transition", "add_joint_masks", "make_infos"]
-
 
 class Transition(NamedTuple):
     """A step of all B rows, M of which have ended; whoever steps the engine makes infos from it."""

@@ -16,8 +16,6 @@ from mapp_env.grid import Grid
 from mapp_env.map_format import MAX_SIDE
 from mapp_env.validation import MAX_SEED, check_count, check_number
 
-__all__ = ["GENERATORS", "maze_grid", "random_grid", "rooms_grid", "warehouse_grid"]
-
 MAX_DENSITY = 0.4
 """Largest share of walls in ``random``: with about 0.407 a large grid falls apart (the site
 percolation threshold of the square lattice)."""

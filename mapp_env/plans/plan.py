@@ -18,8 +18,6 @@ from mapp_env.problem import MAX_CYCLES, Problem
 from mapp_env.records import MAX_INTEGER, MAX_PLAN_BYTES, Record, read_record, write_record
 from mapp_env.validation import as_real, check_choice, check_count, describe
 
-__all__ = ["OBJECTIVES", "STATUSES", "Plan", "replay"]
-
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 STATUSES = ("optimal", "feasible", "infeasible")
 

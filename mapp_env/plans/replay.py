@@ -17,8 +17,6 @@ from mapp_env.grid import Grid
 from mapp_env.problem import Problem
 from mapp_env.validation import as_array, describe
 
-__all__ = ["Episode", "check_joint_actions", "play_episode"]
-
 
 class Episode(NamedTuple):
     """What was played; :class:`~mapp_env.plans.plan.Plan` says what its fields are."""
@@ -129,10 +127,7 @@ def play_row(
 def check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]:
     """Return joint actions as an int64 array of shape (T, N).
 
-    Raises
-    ------
-    ValueError
-        If the shape is wrong or an action is not one.
+    Raises a ValueError if the shape is wrong or an action is not one.
     """
     array = as_array(joint_actions)
     if array.shape in ((0,), (0, n_agents)):

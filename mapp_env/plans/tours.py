@@ -13,8 +13,6 @@ from mapp_env.grid import Grid
 from mapp_env.problem import Problem
 from mapp_env.validation import as_array, as_integer, describe
 
-__all__ = ["check_tours", "moves_of", "tour_of", "tour_through", "walk_tours"]
-
 
 def tour_through(grid: Grid, landmarks: Iterable[int]) -> tuple[int, ...]:
     """Return the cells of shortest paths depot -> landmarks in order -> depot, or ``()``."""
@@ -109,10 +107,8 @@ def _idle_actions(
 def check_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> None:
     """Check that each tour is a closed walk from the depot, or empty.
 
-    Raises
-    ------
-    ValueError
-        If one enters a wall, does not start and end at the depot, jumps or stands still.
+    Raises a ValueError if one enters a wall, does not start and end at the depot, jumps or stands
+    still.
     """
     grid = problem.grid
     for agent, tour in enumerate(tours):

@@ -20,8 +20,6 @@ from mapp_env.problem import Problem
 from mapp_env.rendering.rgb_array import Frame, rgb_array
 from mapp_env.validation import check_count, check_flag, check_number, describe
 
-__all__ = ["MAX_FRAMES", "MAX_PIXELS", "save_animation", "save_gif", "scenes"]
-
 MAX_FRAMES = 2_000
 MAX_PIXELS = 1 << 28  # of all frames together: 960 of the default grid; they are kept in memory
 MAX_BYTES = 1 << 28

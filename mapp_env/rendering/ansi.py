@@ -8,8 +8,6 @@ import numpy as np
 
 from mapp_env.engine.scene import Scene
 
-__all__ = ["ansi"]
-
 FREE, WALL, DEPOT, UNVISITED, VISITED, SEVERAL = ".", "#", "D", "*", "x", "&"
 
 

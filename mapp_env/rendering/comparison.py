@@ -15,8 +15,6 @@ from mapp_env.rendering.figures import DPI, Panel, costs_of, draw_plan, save_fig
 from mapp_env.rendering.palette import INK, to_hex
 from mapp_env.rendering.side_by_side import Gap, check_plans, gaps
 
-__all__ = ["compare_plans"]
-
 MAX_LABEL = 60  # characters
 COLUMNS = 3
 LARGE_SIDE = 7.0  # inches, of a map with many cells

@@ -12,8 +12,6 @@ from mapp_env.engine.scene import Scene
 if TYPE_CHECKING:
     from mapp_env.rendering.human import Window
 
-__all__ = ["Display"]
-
 
 class Display:
     """What stands behind ``render()`` of every face.

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from mapp_env.plans.plan import Plan
     from mapp_env.problem import Problem
 
-__all__ = ["FORMATS", "Panel", "costs_of", "draw_plan", "save_figure"]
 
 FORMATS = (".png", ".svg", ".pdf")
 MAX_BYTES = 1 << 28

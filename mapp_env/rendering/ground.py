@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from mapp_env.grid import Grid
 
-__all__ = ["NOT_VISITED", "Point", "Signs", "draw_ground", "middle_of"]
 
 OUTLINED_SIDE = 64  # grids up to this side have their cells outlined
 LEAST_FLAG, LEAST_HOUSE, MOST_SIGN = 13.0, 15.0, 44.0  # points

@@ -25,8 +25,6 @@ finally:
     else:
         os.environ[_PROMPT] = _had_prompt
 
-__all__ = ["Window"]
-
 
 class Window:
     """A window that shows frames at a steady pace.

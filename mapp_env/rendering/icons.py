@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-__all__ = ["disc", "flag", "house", "text"]
 
 OVERSAMPLING = 4
 

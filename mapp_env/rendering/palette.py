@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-__all__ = ["Colour", "agent_colour", "blend", "ink_on", "to_hex"]
-
 Colour: TypeAlias = tuple[int, int, int]
 
 FLOOR: Colour = (250, 248, 243)

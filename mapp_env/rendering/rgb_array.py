@@ -32,7 +32,6 @@ from mapp_env.rendering.palette import (
 if TYPE_CHECKING:
     from mapp_env.grid import Grid
 
-__all__ = ["Frame", "paste", "rgb_array"]
 
 MAX_SIDE = 1024  # default pixels of the longer side of the grid, margins and bar not counted
 MAX_CELL = 72

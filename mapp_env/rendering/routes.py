@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mapp_env.grid import Grid
     from mapp_env.plans.plan import Plan
 
-__all__ = ["DASHES", "draw_routes"]
 
 ARROWS_APART = 20.0  # points, at least
 LEAST_WIDTH, MOST_WIDTH = 0.9, 2.4  # points, of a line

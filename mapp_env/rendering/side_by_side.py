@@ -16,8 +16,6 @@ from mapp_env.rendering.palette import INK, PAPER, blend
 from mapp_env.rendering.rgb_array import Frame, paste, rgb_array
 from mapp_env.validation import check_count, describe
 
-__all__ = ["MAX_PLANS", "Gap", "animate_plans", "check_plans", "gaps"]
-
 MAX_PLANS = 12
 
 BETWEEN = 12  # pixels between two panels

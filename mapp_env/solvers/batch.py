@@ -16,8 +16,6 @@ from mapp_env.solvers.held_karp import Steps, route_costs, shortest_routes
 from mapp_env.solvers.solution import cell_distances, team_of
 from mapp_env.validation import as_array, check_choice, check_count, describe
 
-__all__ = ["MAX_BATCH_LANDMARKS", "optimal_costs", "solve_universe"]
-
 MAX_BATCH_LANDMARKS = 12
 """Largest number of landmarks of each problem."""
 

@@ -13,8 +13,6 @@ from mapp_env.solvers.held_karp import Steps, route_tables
 from mapp_env.solvers.solution import UNBOUNDED, team_of
 from mapp_env.validation import check_choice
 
-__all__ = ["lower_bound", "subset_bound", "tree_bound"]
-
 SUBSET = 12
 """Landmarks that :func:`subset_bound` looks at: about a millisecond."""
 
@@ -28,10 +26,7 @@ def lower_bound(problem: Problem, objective: str, distances: Steps) -> int:
 
     ``distances`` are from :func:`~mapp_env.solvers.solution.landmark_distances`.
 
-    Raises
-    ------
-    ValueError
-        If the objective is unknown.
+    Raises a ValueError if the objective is unknown.
     """
     check_choice("objective", objective, OBJECTIVES)
     teams, closed = team_of(objective, problem.n_agents, len(distances) - 1)

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from mapp_env.solvers.solution import UNBOUNDED
 
-__all__ = ["NOBODY", "assign_landmarks"]
-
 NOBODY = -1
 
 

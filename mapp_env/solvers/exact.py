@@ -27,8 +27,6 @@ from mapp_env.problem import Problem
 from mapp_env.solvers.held_karp import Steps, route_tables, tours_within, trace_route
 from mapp_env.solvers.solution import Solution, landmark_distances, solution_of, team_of
 
-__all__ = ["MAX_EXACT_LANDMARKS", "smallest_limit", "solve_exact"]
-
 MAX_EXACT_LANDMARKS = 20
 """Largest number of landmarks: the table of routes takes 80 MiB then."""
 

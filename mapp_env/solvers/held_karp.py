@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.grid import FAR
 
-__all__ = ["Steps", "route_costs", "route_tables", "shortest_routes", "tours_within", "trace_route"]
-
 Steps: TypeAlias = NDArray[np.int32]
 
 

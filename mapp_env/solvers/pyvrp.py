@@ -22,8 +22,6 @@ from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 
-__all__ = ["DEFAULT_SECONDS", "import_pyvrp", "solve_pyvrp"]
-
 DEFAULT_SECONDS = 2.0
 """Time limit if none is given."""
 

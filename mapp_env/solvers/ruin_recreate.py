@@ -24,8 +24,6 @@ from mapp_env.compiled import kernel
 from mapp_env.problem import next_word, scramble
 from mapp_env.solvers.solution import UNBOUNDED
 
-__all__ = ["Layout", "Scratch", "Team", "improve"]
-
 PATIENCE = 5_000
 """Iterations without a smaller total distance before a search ends whose cost is proven optimal."""
 

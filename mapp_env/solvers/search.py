@@ -31,8 +31,6 @@ from mapp_env.solvers.ruin_recreate import (
 from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 from mapp_env.validation import check_count
 
-__all__ = ["DEFAULT_ITERATIONS", "Search", "solve_search"]
-
 DEFAULT_ITERATIONS = 200_000
 """Iterations without a time limit: well under a second for 50 landmarks, on any clock."""
 

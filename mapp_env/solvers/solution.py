@@ -12,17 +12,6 @@ from numpy.typing import NDArray
 from mapp_env.grid import Grid, fill_distances
 from mapp_env.problem import Problem
 
-__all__ = [
-    "UNBOUNDED",
-    "Routes",
-    "Solution",
-    "Solver",
-    "cell_distances",
-    "landmark_distances",
-    "solution_of",
-    "team_of",
-]
-
 UNBOUNDED = 1 << 60
 """More than any cost, weighted or scaled, and twice it is still an int64."""
 

@@ -8,8 +8,6 @@ from mapp_env.files import write_text
 from mapp_env.problem import Problem
 from mapp_env.solvers.solution import landmark_distances
 
-__all__ = ["save_vrplib"]
-
 MAX_BYTES = 1 << 20
 
 
