@@ -86,7 +86,7 @@ class Args(ImitationOptions):
     from_depot: Share = 0.95
     """share of episodes that start at the depot with all landmarks unvisited"""
     max_length: Annotated[int, Within(1, 1_000_000)] = 12
-    """steps after which an episode is given up"""
+    """step limit of an episode"""
 
 
 # -- learner -----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Evaluate a policy, each result beside the proven optimum.
+"""Evaluate a policy against the proven optimum.
 
 Command::
 
@@ -172,7 +172,7 @@ def choose_problems(
 
 
 def worst_cases(evaluation: Evaluation) -> list[str]:
-    """Return lines on problems that nobody solves, that this one does not, and the largest gap."""
+    """Return lines on unsolvable and unsolved problems and on the largest gap."""
     optima, unsolved = evaluation.optima, ~evaluation.success
     lines = out_of_reach(evaluation.setting, optima)
     if optima is None:

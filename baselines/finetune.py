@@ -67,7 +67,7 @@ class Args(solving.Args):
     episodes: int = 30
     """most episodes to play"""
     random_episodes: int = 8
-    """how many of them, after the first, walk at random"""
+    """number of random-walk episodes after the first"""
     imagined: int = 4096
     """episodes imagined before each of the others"""
     updates_per_episode: int = 10
@@ -75,7 +75,7 @@ class Args(solving.Args):
     learning_rate: float = 0.002
     """step size of Adam"""
     patience: int = 5
-    """it ends early when so many of its own episodes have not become shorter"""
+    """stop after this many of its own episodes without improvement"""
     seed: int = 0
     """seed of everything random"""
 
@@ -180,7 +180,7 @@ class Tuner:
         limit = problem.max_cycles if self.best is None else len(self.best.joint)
         for _ in range(limit or 0):
             known = (self.moves[cells[:, None, :], self.digits] != UNKNOWN).all(axis=2)
-            going_on = known.any(axis=1)  # the others are where nobody has moved from
+            going_on = known.any(axis=1)  # the others are on cells without known moves
             if not going_on.any():
                 return None
             observations.append(join(cells, landmarks, visited))

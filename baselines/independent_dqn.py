@@ -1,4 +1,4 @@
-"""Each agent has a network of its own: independent learners, trained by deep Q-learning.
+"""Independent learners: one network per agent, trained by deep Q-learning.
 
 Method: independent Q-learning (Tan 1993) with DQN (Mnih et al. 2015). Every learner has its own
 network, target network, optimiser, memory and random numbers, tosses its own coin to explore, sees
@@ -231,7 +231,7 @@ class IndependentLearners:
 
     @property
     def ready(self) -> bool:
-        """Whether there is something to learn from."""
+        """Whether enough has been stored to learn."""
         return all(learner.replay.ready for learner in self.learners)
 
     def update(self, progress: float) -> float:
@@ -244,7 +244,7 @@ class IndependentLearners:
         return self.learners[0].updates
 
     def policy(self) -> NetworkPolicy:
-        """Return what was learned."""
+        """Return the trained policy."""
         return NetworkPolicy(self.network)
 
     # -- checkpoints
@@ -258,11 +258,11 @@ class IndependentLearners:
         }
 
     def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
+        """Return all other state, as JSON-ready values."""
         return {"learners": [learner.state() for learner in self.learners]}
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what :meth:`arrays` and :meth:`state` returned."""
+        """Restore what :meth:`arrays` and :meth:`state` returned."""
         states = state["learners"]
         for index, (learner, own) in enumerate(zip(self.learners, states, strict=True)):
             learner.restore(part(arrays, str(index)), own)

@@ -111,7 +111,7 @@ class MetaLearner(QLearner):
 
     @property
     def ready(self) -> bool:
-        """Whether there is something to learn from."""
+        """Whether enough has been stored to learn."""
         return self.replay.ready
 
     @torch.no_grad()
@@ -171,7 +171,7 @@ class MetaLearner(QLearner):
         return loss.item()
 
     def policy(self) -> NetworkPolicy:
-        """Return what was learned."""
+        """Return the trained policy."""
         return NetworkPolicy(self.network)
 
     # -- checkpoints
@@ -181,7 +181,7 @@ class MetaLearner(QLearner):
         return {**super().arrays(), "here": self.here.cpu().numpy()}
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what was saved."""
+        """Restore a checkpoint."""
         super().restore(arrays, state)
         self.here = torch.from_numpy(take(arrays, "here", self.here.cpu().numpy()))
 

@@ -1,4 +1,4 @@
-"""What the best possible policy for a reward achieves: the ceiling of whoever trains on it.
+"""What the best possible policy for a reward achieves: the ceiling for training on it.
 
 Method: value iteration over all states of a problem (cells of the agents x unvisited landmarks),
 without any learning; then the cover time of the policy that is optimal for the discounted reward,

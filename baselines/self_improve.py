@@ -73,7 +73,7 @@ class Args(ImitationOptions):
     kept_states: Annotated[int, Within(1, 10_000_000)] = 20_000
     """states of such episodes that are kept; the oldest is forgotten first"""
     max_length: Annotated[int, Within(1, 1_000_000)] = 16
-    """steps after which an episode is given up"""
+    """step limit of an episode"""
     inverse_temperature: Positive = 8.0
     """what the values of the policy are multiplied by to be read as logits at the start"""
     detour: Annotated[float, Within(0.0, 10.0)] = 0.03
@@ -169,7 +169,7 @@ class SelfImproved(Imitation):
             self.keep(self.label(landmarks, obs, joint, shortest, shorter))
 
     def episodes(self, landmarks: np.ndarray) -> Episodes:
-        """Play an episode on each row of landmarks: every so-many-th greedily."""
+        """Play one episode per row of landmarks; every n-th row is greedy."""
         greedy = np.arange(len(landmarks)) % self.args.episodes == 0
         return rollout(
             self.envs,

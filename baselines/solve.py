@@ -1,4 +1,4 @@
-"""Let a trained policy solve one problem, beside the proven optimum.
+"""Solve one problem with a trained policy and compare it with the proven optimum.
 
 Command::
 

@@ -1,4 +1,4 @@
-"""Files that strangers may have written: read with suspicion, written whole or not at all."""
+"""Files: untrusted input is validated, output is written atomically."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def write_bytes(path: str | os.PathLike[str], data: bytes, limit: int) -> None:
 def check_writable(path: str | os.PathLike[str]) -> str:
     """Return what a path leads to, if a file could stand there.
 
-    For what takes long to make, so that a slip of the pen is noticed before.
+    Lets a mistyped path fail before a long computation.
 
     Raises a FileError if it is no path, its folder is not there, or there is something already that
     is no file or may not be written.

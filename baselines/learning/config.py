@@ -34,7 +34,7 @@ class RunOptions:
     out: Path | None = None
     """the run folder, new or empty; by default runs/ALGORITHM-PRESET-seedSEED-TIME"""
     resume: Path | None = None
-    """a run folder whose training goes on where it stopped, with its own options"""
+    """run folder to resume, with its own options"""
     evaluation_problems: Annotated[int, Within(0, 1_000_000)] = 1000
     """unseen problems for the table at the end, or all there are if they are fewer; 0 for none"""
     checkpoint_seconds: Annotated[float, Within(0.0, 1e9)] = 30.0
@@ -79,7 +79,7 @@ class Options(RunOptions):
     }
 
     preset: Literal["default", "paper"] = "default"
-    """where the other options start from; "paper": section 5 of the paper, and for what it leaves
+    """preset of the other options; "paper": section 5 of the paper, and for what it leaves
     open the choices listed in docs/paper.md; "default": the same observation and the same
     episodes, learned from better (docs/baselines.md)"""
 
@@ -117,19 +117,19 @@ class Options(RunOptions):
     learning_rate: Annotated[float, Within(1e-12, 1.0)] = 0.006
     """step size of Adam"""
     learning_rate_falls: bool = True
-    """whether the step size falls in a straight line to 0 over the episodes"""
+    """whether the learning rate decays linearly to 0 over the episodes"""
     learning_rate_warmup: Annotated[int, Within(0, 1_000_000_000)] = 200
-    """updates over which the step size rises to its value"""
+    """updates of linear learning-rate warm-up"""
     weight_decay: Share = 0.0
     """share of every weight, times the step size, that each update takes off it"""
     discount: Share = 0.95
     """discount factor of future rewards"""
     reward_scale: Positive = 0.1
-    """what rewards are multiplied by, to keep values of the order of one"""
+    """factor for rewards, to keep values of the order of one"""
     huber_delta: Positive = 0.3
-    """error at which the loss turns from a square into a line"""
+    """error at which the Huber loss changes from quadratic to linear"""
     action_gap: Share = 0.5
-    """how much of what an action falls short of the best one in its state is taken off its target:
+    """fraction of an action's gap to the best one in its state to subtract from its target:
     advantage learning (Bellemare et al. 2016), which keeps the best action and widens the gap;
     has no effect on stored transitions"""
     double: bool = False
@@ -145,16 +145,16 @@ class Options(RunOptions):
     target_interval: Annotated[int, Within(0, 1_000_000)] = 0
     """updates between two copies of the network to the target network; 0 to use target_rate"""
     target_rate: Share = 0.03
-    """how far the target network moves towards the network at each update"""
+    """fraction by which the target network moves towards the network at each update"""
 
     final_reward: Literal[Reward, "same"] = "step"
-    """reward that imagined transitions are given towards the end, or the same as before"""
+    """reward of imagined transitions in the final phase, or the same as before"""
     final_from: Share = 0.2
-    """part of the episodes after which that is so"""
+    """fraction of the episodes after which the final phase begins"""
     final_discount: Share = 0.98
-    """discount factor from then on"""
+    """discount factor in the final phase"""
     final_reward_scale: Positive = 0.333
-    """reward scale from then on"""
+    """reward scale in the final phase"""
 
     replay: Literal["imagined", "stored"] = "imagined"
     """"stored": transitions as they were played; "imagined": experienced moves, recombined among
@@ -162,17 +162,17 @@ class Options(RunOptions):
     memory_size: Annotated[int, Within(1, 10_000_000)] = 10_000
     """transitions in the replay memory, if stored; the oldest is forgotten first"""
     tried_actions: Annotated[int, Within(1, 1024)] = 2
-    """joint actions tried in each imagined state: the best, then others the better the likelier"""
+    """joint actions tried in each imagined state: the best, then others, better ones more often"""
     temperature: Positive = 0.3
-    """difference of value at which another action is tried e times less"""
+    """Boltzmann temperature: an action whose value is lower by this is tried e times less often"""
     imagined_exploration: Share = 0.05
     """probability that an imagined episode follows any of those tried, not the best"""
     imagined_from_depot: Share = 0.9
     """share of imagined episodes that start at the depot with all landmarks unvisited"""
     imagined_length: Annotated[int, Within(1, 1_000_000)] = 16
-    """steps after which an imagined episode is given up"""
+    """step limit of an imagined episode"""
     imagined_retries: Share = 0.9
-    """probability that an episode that was given up is begun again from the depot"""
+    """probability that an episode that reached this limit restarts from the depot"""
 
     epsilon_start: Share = 1.0
     """probability at the first step that an agent takes a random action"""
@@ -188,7 +188,7 @@ class Options(RunOptions):
     guidance_fraction: Share = 0.8
     """part of the episodes over which the guidance falls in a straight line"""
     guidance_reach: Annotated[int, Within(1, 512)] = 3
-    """how many moves away, straight and with no wall between, a landmark is still close"""
+    """most moves, in a straight line without walls, at which a landmark counts as close"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,7 +202,7 @@ class Options(RunOptions):
 
 
 def without_effect(options: Options) -> dict[str, str]:
-    """Return the options that the choice of another leaves without effect, and that choice."""
+    """Return the options that have no effect, each with the option that disables it."""
     o = options
     replay: str = o.replay  # that of independent learners has one more
     final = ("final_reward", "final_discount", "final_reward_scale")
@@ -260,7 +260,7 @@ def preset_options(kind: type[Chosen], preset: str, **changes: Any) -> Chosen:
 def parse_options(
     kind: type[Chosen], description: str, words: Sequence[str] | None = None
 ) -> Chosen:
-    """Read the options from a command line: a preset's, where nothing else is said.
+    """Read the options from a command line; the preset gives those not set.
 
     Parameters
     ----------

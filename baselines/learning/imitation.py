@@ -121,7 +121,7 @@ class Imitation(Trainable):
         return joined({"network": weights, "optimiser": optimiser, **self.own_arrays()})
 
     def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
+        """Return all other state, as JSON-ready values."""
         return {
             "updates": self.updates,
             "rng": self.rng.bit_generator.state,
@@ -130,7 +130,7 @@ class Imitation(Trainable):
         }
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what was saved."""
+        """Restore a checkpoint."""
         weights = part(arrays, "network")
         self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
         self.updates, self.losses = state["updates"], list(state["losses"])
@@ -140,7 +140,7 @@ class Imitation(Trainable):
         self.watch.seconds = dict(state["seconds"])
 
     def check_metrics(self, table: dict[str, list[float]]) -> None:
-        """Compare where it stands with the rows that are written."""
+        """Check the progress against the rows of metrics.csv."""
         rows, left = divmod(self.updates, LOGGED)
         if (len(table["updates"]), len(self.losses)) != (rows, left):
             raise ValueError(
@@ -164,7 +164,7 @@ def good_actions_loss(scores: Tensor, good: Tensor) -> Tensor:
 
 
 def start_of(resume: Path | None, policy: str | Path | None) -> str | Path | None:
-    """Return where the policy is that a training starts from.
+    """Return the path of the policy to start from.
 
     Of a resumed run it is in its own folder, if the run was not killed before it was there.
     """

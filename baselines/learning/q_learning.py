@@ -32,7 +32,7 @@ class Goal(NamedTuple):
 
 
 def make_goals(args: Options, grid: Grid) -> tuple[Goal, Goal]:
-    """Return what is aimed at to begin with, and later.
+    """Return the reward and discount of the initial and of the final phase.
 
     Raises a ValueError if transitions are relabelled, and the grid has too many cells for a table
     of distances between all of them.
@@ -131,7 +131,7 @@ def next_values(values: Tensor, chooser: Tensor, known: np.ndarray | None) -> Te
 
 
 def td_targets(rewards: Tensor, terminated: Tensor, next_values: Tensor, discount: float) -> Tensor:
-    """Return what the chosen values should be.
+    """Return the TD targets of the chosen values.
 
     With a value for each joint action that is the reward and the best value of the next state.
     With values for each agent's actions every agent gets the team reward, and goes on with the
@@ -186,7 +186,7 @@ class QLearner:
     network, target
         Two networks of one kind; the target starts as the network's copy.
     replay
-        What is learned from.
+        The replay buffer.
     rng
         Source of all batches.
     """
@@ -244,11 +244,11 @@ class QLearner:
         }
 
     def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
+        """Return all other state, as JSON-ready values."""
         return {"updates": self.updates, "rng": self.rng.bit_generator.state}
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what :meth:`arrays` and :meth:`state` returned."""
+        """Restore what :meth:`arrays` and :meth:`state` returned."""
         for name, network in (("network", self.network), ("target", self.target)):
             weights = part(arrays, name)
             network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})

@@ -71,7 +71,7 @@ class Run(NamedTuple):
 
     @property
     def arguments(self) -> list[str]:
-        """Words of the command line that start it, or go on with it."""
+        """Arguments that start or resume it."""
         if (self.folder / CONFIG_FILE).exists():
             return ["--resume", str(self.folder)]
         return [*self.words, "--out", str(self.folder)]
@@ -100,7 +100,7 @@ class Run(NamedTuple):
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
         with self.log.open("ab") as log:
             return subprocess.Popen(
-                # -P: what lies in the working folder is none of its modules.
+                # -P: never import from the working directory.
                 [sys.executable, "-P", "-m", f"baselines.{self.algorithm}", *self.arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -116,7 +116,7 @@ class Run(NamedTuple):
         return read_outcome(self.group, self.folder, self.options.max_cycles)
 
     def check_folder(self) -> None:
-        """Refuse what was trained with other options, and what is no training.
+        """Refuse a folder that holds a trial with other options, or anything else.
 
         Raises a ValueError if its folder holds anything else.
         """

@@ -107,7 +107,7 @@ def interval(values: np.ndarray) -> Interval:
 
 
 class Summary(NamedTuple):
-    """What came out of a group of trainings, over its seeds."""
+    """The results of a group of trials over its seeds."""
 
     group: tuple[str, ...]
     outcomes: list[Outcome]
@@ -124,7 +124,7 @@ def summarise(outcomes: Iterable[Outcome]) -> list[Summary]:
         measures = {}
         for name in MEASURES:
             values = np.array([outcome.measures[name] for outcome in members])
-            # Who solves no problem has no gap.
+            # Without solved problems there is no gap.
             measures[name] = interval(values[~np.isnan(values)])
         summaries.append(Summary(group, members, measures))
     return summaries

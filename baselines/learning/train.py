@@ -129,14 +129,14 @@ def run_training(
         If an option or the folder cannot be used, or the folder cannot be written into.
     """
     torch.set_num_threads(args.threads)
-    # All that can be refused is refused before anything is written.
+    # Validate everything before anything is written.
     n_evaluated = min(args.evaluation_problems, count_unseen(setting, problems))
     unseen = unseen_problems(setting, n_evaluated, problems) if n_evaluated else None
     training = make_training()
     preset = getattr(args, "preset", "default")
     name = f"{algorithm}-{preset}-seed{args.seed}-{datetime.now():%Y%m%d-%H%M%S}"
     folder = args.resume or args.out or Path("runs") / name
-    # The folder's name is none of what a run is: it may be moved.
+    # The folder's name is not part of the config: a run may be moved.
     task = {name: getattr(setting, name) for name in TASK}
     config = {
         "algorithm": algorithm,
@@ -156,7 +156,7 @@ def run_training(
                     f"{n_evaluated:,} of {args.evaluation_problems:,} evaluation problems: there "
                     "are no more unseen ones"
                 )
-            # Without a terminal there is no bar: say where to look.
+            # No progress bar without a terminal: print where to look.
             where = run.path(METRICS_FILE)
             print(f"training, {training.total:,} {training.UNIT}: {where}", flush=True)
             train(training, setting.grid, run, checkpoints, signals)

@@ -47,17 +47,17 @@ class Learner(Saved, Protocol):
 
     @property
     def ready(self) -> bool:
-        """Whether there is something to learn from."""
+        """Whether enough has been stored to learn."""
 
     def update(self, progress: float) -> float:
         """Learn from one batch; return the loss."""
 
     def policy(self) -> NetworkPolicy:
-        """Return what was learned."""
+        """Return the trained policy."""
 
 
 class Streams(NamedTuple):
-    """A stream for everything random, so that one more draw here moves nothing there."""
+    """Separate random streams, so that an extra draw in one does not shift the others."""
 
     network: np.random.SeedSequence
     problems: np.random.SeedSequence
@@ -114,7 +114,7 @@ class Training(Trainable):
             max_cycles=args.max_cycles,
             reward=args.reward,
         )
-        self.leader = self.env.possible_agents[0]  # all see the same and are rewarded the same
+        self.leader = self.env.possible_agents[0]  # the same for all agents
         self.rng = np.random.default_rng(Streams.spawn(args.seed).acting)
         self.guidance = Guidance(grid, args.n_agents, args.n_landmarks, args.guidance_reach)
         self.epsilon_at = LinearSchedule(args.epsilon_start, args.epsilon_end, args.epsilon_steps)
@@ -180,7 +180,7 @@ class Training(Trainable):
         self.watch.lap("memory")
 
     def _choose(self, epsilon: float) -> np.ndarray:
-        """Return an epsilon-greedy joint action (N,): each agent tosses its own coin."""
+        """Return an epsilon-greedy joint action (N,); each agent explores independently."""
         n_agents = self.args.n_agents
         random_actions = self.rng.integers(N_ACTIONS, size=n_agents)
         explores = self.rng.random(n_agents) < epsilon
@@ -225,7 +225,7 @@ class Training(Trainable):
         return self.learner.arrays()
 
     def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
+        """Return all other state, as JSON-ready values."""
         return {
             "progress": asdict(self.now),
             "observation": self.observation.tolist(),

@@ -19,7 +19,7 @@ TEAMS = ("one", "independent", "shared")
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """What is needed to build a network; validated, since it is also read from files.
+    """Specification of a network; validated, since it is also read from files.
 
     Each network has a spec of its own, with what only it needs beside these fields.
     """

@@ -13,7 +13,7 @@ Array = TypeVar("Array", np.ndarray, Tensor)
 
 
 class Team(Network):
-    """Networks of agents that act for themselves: one for each agent, or one that each uses.
+    """Networks of independent agents: one per agent, or one shared by all.
 
     An agent's network gives values of this agent's own actions. With one for each, all see the
     observation as it is, but for "geodesic". A shared one is told whose turn it is (:func:`view`).

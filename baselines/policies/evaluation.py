@@ -1,4 +1,4 @@
-"""How good a policy is: what it costs on many problems, beside the proven optimum of each.
+"""Evaluate a policy on many problems against the proven optimum of each.
 
 A problem is solved when every landmark was visited within the step limit. The gap of a solved
 problem is (cover time - optimum) / optimum; optima are proven up to 20 landmarks.
@@ -168,7 +168,7 @@ def evaluate(
     n_kept: int = 0,
     progress: str | None = None,
 ) -> Evaluation:
-    """Let a policy play each problem once.
+    """Evaluate a policy for one episode on each problem.
 
     Parameters
     ----------
@@ -232,7 +232,7 @@ def evaluate(
                 for name, cost in costs.items():
                     cost[rows[ended]] = infos["metrics"][name][ended]
                 bar.update(int(ended.sum()))
-            unfinished &= ~ended  # what the row plays after its reset is nobody's problem
+            unfinished &= ~ended  # results after a row's reset are ignored
             if not unfinished.any():
                 break
     bar.close()

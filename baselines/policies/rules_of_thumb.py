@@ -33,7 +33,7 @@ class NearestLandmarkPolicy:
     """Every agent walks a shortest path to the unvisited landmark nearest to it.
 
     Of equally near landmarks the one given first counts, of equally good moves the first action.
-    Nobody coordinates: agents that stand together walk together.
+    Agents do not coordinate: those on the same cell walk together.
     """
 
     def __init__(self, grid: Grid, n_agents: int, n_landmarks: int) -> None:

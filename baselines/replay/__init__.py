@@ -1,1 +1,1 @@
-"""What is learned from: transitions stored, relabelled or imagined."""
+"""Replay: stored, relabelled or imagined transitions."""

@@ -1,4 +1,4 @@
-"""Replay by imagination: what was experienced, put together anew.
+"""Imagined replay: experienced moves, recombined.
 
 Two facts make every experienced move useful for every problem. Landmarks do not influence how
 agents move, so a stored move is a move among any landmarks (relabelling, in the spirit of

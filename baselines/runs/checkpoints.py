@@ -1,4 +1,4 @@
-"""Checkpoints: all that a training needs to go on as if it had never stopped.
+"""Checkpoints: everything a run needs to resume as if never interrupted.
 
 A checkpoint is two files in the run's folder ``checkpoints``: ``<number>.safetensors`` holds the
 arrays, ``<number>.json`` everything else, and the digests of both. Each is written beside its
@@ -49,7 +49,7 @@ class Saved(Protocol):
         """Return all arrays that change, by name."""
 
     def state(self) -> dict[str, Any]:
-        """Return all else that changes, ready for JSON."""
+        """Return all other state, as JSON-ready values."""
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
         """Take over what the two above returned; a ValueError if something is not there."""

@@ -174,7 +174,7 @@ class RunFolder:
         return parse_metrics(path, content)
 
     def rewind(self, position: Mapping[str, Any]) -> None:
-        """Cut metrics.csv back to where a checkpoint was written; what came later comes again."""
+        """Truncate metrics.csv to a checkpoint; later rows will be written again."""
         self._metrics.truncate(position["bytes"])
         self._metrics.seek(position["bytes"])
 

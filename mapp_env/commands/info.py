@@ -1,4 +1,4 @@
-"""Say what runs here: versions, the cache of compiled code, the machine.
+"""Show versions, the cache of compiled code and the machine.
 
 For example:
   for people, and for a bug report

@@ -1,4 +1,4 @@
-"""Policies that other packages bring along: how a command finds one, and lets it play.
+"""Policies from other packages: loading and running them.
 
 The package knows rules and solvers, no learners. A loader is named by text and imported only when
 a policy is asked for; by default it is that of the baselines that are developed beside the package.

@@ -13,7 +13,7 @@ from mapp_env.problem import Problem
 
 
 class OutputError(Exception):
-    """What was found out cannot be printed."""
+    """A report that cannot be written."""
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +59,7 @@ def costs_line(problem: Problem, plan: Plan) -> str:
 
 
 def landmarks_line(problem: Problem) -> str:
-    """Return where the landmarks are: who had them drawn does not know."""
+    """Return the landmarks' cells, which a user who had them drawn does not know."""
     return f"landmarks: {' '.join(map(str, problem.landmarks))}"
 
 

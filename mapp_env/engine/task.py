@@ -148,7 +148,7 @@ class Task:
         )
 
     def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
-        """Refuse a number of rows whose arrays would not fit in memory.
+        """Check that the arrays for a number of rows fit in memory.
 
         Raises a ValueError if the observations or the joint actions' masks of one step, or the
         distance fields, take more than 1 GiB.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Display:
-    """What stands behind ``render()`` of every face.
+    """The implementation of ``render()`` for every interface.
 
     Parameters
     ----------

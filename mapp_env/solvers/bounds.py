@@ -61,7 +61,7 @@ def tree_bound(distances: Steps, teams: int, closed: bool) -> int:
 def subset_bound(distances: Steps, teams: int, closed: bool, low: int) -> int:
     """Return the optimum of 12 landmarks, or ``low`` if that is larger.
 
-    With landmarks left out a plan is a plan still: no optimum falls with a landmark more. The
+    Leaving landmarks out keeps a plan valid, so another landmark never lowers the optimum. The
     farthest from the depot comes first, then always the one for which the distance to the nearest
     chosen landmark and the distance to the depot have the largest sum.
     """
