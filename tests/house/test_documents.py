@@ -261,7 +261,7 @@ def test_each_logged_metric_is_explained() -> None:
 
 def test_code_blocks_say_what_they_are() -> None:
     """Every block is Python or a command, which are run, or else text that nobody could run."""
-    known = {"python", "bash", "text", "markdown", "bibtex", "{eval-rst}"}
+    known = {"python", "bash", "text", "markdown", "bibtex", "diff", "{eval-rst}"}
     for path in DOCUMENTS:
         fences = re.findall(r"^\s*```(.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
         assert len(fences) % 2 == 0, path.name
