@@ -36,8 +36,8 @@ CHECKS = {
             assert single == envs.step(np.array([joint]))[1][0] == model.reward()
         assert "count" in REWARDS and parse_options(Args, "", ["--reward", "count"])
         world = relabelled_reward(make_grid(), 3, 3, "count").world
-        rewards = visit_rows(world, np.array([[17, 0, 0]]), np.array([landmarks]), np.zeros((1, 3)))[1]
-        assert rewards == [-2.0]
+        cells, unvisited = np.array([[17, 0, 0]]), np.zeros((1, 3), bool)
+        assert visit_rows(world, cells, np.array([landmarks]), unvisited)[1] == [-2.0]
     """,
     "observation": """
         from mapp_env import make_vec, mapp_v0
