@@ -152,9 +152,10 @@ def test_imports_have_no_cycle() -> None:
 
 def test_rooms_are_small() -> None:
     """A dozen files at one level is plenty, and scripts and their parts never stand mixed."""
+    first_name = REPOSITORY / "baselines" / "policy.py"  # of load_policy: not a file of its own
     for folder in {path.parent for path in (*FILES, *BASELINES)}:
-        count = len([path for path in folder.glob("*.py") if path.name != "__init__.py"])
-        assert count <= 16, f"{folder}: {count} files"
+        names = [path.name for path in folder.glob("*.py") if path != first_name]
+        assert len(names) - ("__init__.py" in names) <= 12, f"{folder}: {names}"
     for path in BASELINES:
         script = "__name__" in path.read_text(encoding="utf-8")
         at_top = path.parent.name == "baselines" and path.name not in {"__init__.py", "policy.py"}
