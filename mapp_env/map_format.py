@@ -60,20 +60,10 @@ def read_map(source: str) -> ParsedMap:
 
 
 def parse_map(text: str, source: str = "text") -> ParsedMap:
-    """Turn a map text, plain or MovingAI, into walls and a depot.
+    """Turn a map text, plain or MovingAI, into walls and a depot; messages call it ``source``.
 
-    Parameters
-    ----------
-    text : str
-        The rows, one a line. Empty lines at either end are ignored, and so are blanks after rows,
-        unless they make up a column.
-    source : str
-        How messages call the text: a path, for a file.
-
-    Raises
-    ------
-    MapError
-        If the text is malformed; the message names the line, counted from 1.
+    Empty lines at either end are ignored, and so are blanks after rows, unless they make up a
+    column. Raises a MapError if the text is malformed, which names the line, counted from 1.
     """
     if len(text) > MAX_FILE_BYTES:
         raise MapError(f"{source}: has {len(text)} characters, a map may have {MAX_FILE_BYTES}")

@@ -120,10 +120,7 @@ class Problem:
 def check_grid(name: str, value: object) -> Grid:
     """Return ``value`` if it is a grid on which a landmark can stand.
 
-    Raises
-    ------
-    ValueError
-        If it is not a :class:`Grid`, or nothing but the depot can be reached.
+    Raises a ValueError if it is not a :class:`Grid`, or nothing but the depot can be reached.
     """
     if not isinstance(value, Grid):
         raise ValueError(f"{name} must be a mapp_env.Grid, got {describe(value)}")
@@ -139,11 +136,8 @@ def check_landmarks(
 
     There must be ``count`` of them, by default any number from 1 to 256; ``name`` is for messages.
 
-    Raises
-    ------
-    ValueError
-        If the number is wrong, or a cell is off the grid, a wall, the depot, unreachable or named
-        twice.
+    Raises a ValueError if the number is wrong, or a cell is off the grid, a wall, the depot,
+    unreachable or named twice.
     """
     given = landmarks
     if isinstance(landmarks, np.ndarray):

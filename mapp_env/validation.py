@@ -25,9 +25,7 @@ def describe(value: object, limit: int = 100) -> str:
         return f"array of shape {value.shape} and dtype {value.dtype}"
     try:
         text = _SHORT.repr(value)
-    except (
-        Exception
-    ):  # a broken or hostile __repr__, or a number with more digits than Python prints
+    except Exception:  # a hostile __repr__, or a number with more digits than Python prints
         text = f"a {type(value).__name__}"
     return text if len(text) <= limit else f"{text[: limit - 3]}..."
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,10 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-__all__ = ["RowsVecEnv"]
+__all__ = ["RowsVecEnv", "Stepped"]
+
+Stepped = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]
+"""Observations (B, ...), rewards (B,), dones (B,) and B infos."""
 
 MASKS = "action_masks"
 """The one method that can be called by row: sb3-contrib's ``MaskablePPO`` does."""
@@ -24,14 +26,8 @@ LIMIT = "max_cycles"
 class RowsVecEnv(VecEnv):
     """Rows of one batch that has all attributes and methods itself.
 
-    Parameters
-    ----------
-    batch : object
-        What is stepped: it has ``num_envs`` rows, attributes and ``close()``.
-    name : str
-        Of the attribute that holds it, for messages.
-    observation_space, action_space : gymnasium.Space
-        Of one row.
+    The spaces are those of one row; ``name`` is of the attribute that holds the batch, for
+    messages.
     """
 
     def __init__(self, batch: Any, name: str, observation_space: Any, action_space: Any) -> None:
@@ -51,16 +47,8 @@ class RowsVecEnv(VecEnv):
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
 
-        Returns
-        -------
-        ndarray of bool, shape (B, ...)
-            Of one agent's actions (B, A), of numbered joint actions (B, A**N), or of each agent's
-            actions, one agent after the other, (B, N * A).
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
+        Of one agent's actions (B, A), of numbered joint actions (B, A**N), or of each agent's
+        actions, one agent after the other, (B, N * A). Raises a ResetNeeded before the first reset.
         """
         if self._masks is None:
             raise ResetNeeded("action_masks() needs episodes: call reset() first")
@@ -69,10 +57,6 @@ class RowsVecEnv(VecEnv):
     @abstractmethod
     def _find_masks(self, masks: NDArray[Any]) -> NDArray[np.bool_]:
         """Return fresh action masks, shape (B, ...), of what is kept in ``_masks``."""
-
-    def _mask_of(self, row: int) -> NDArray[np.bool_]:
-        mask: NDArray[np.bool_] = self.action_masks()[row]
-        return mask
 
     @property
     @abstractmethod
@@ -96,7 +80,7 @@ class RowsVecEnv(VecEnv):
         if attr_name in ("observation_space", "action_space", LIMIT):
             return [getattr(self, attr_name)] * len(rows)  # the batch's are those of all rows
         if attr_name == MASKS:
-            return [partial(self._mask_of, row) for row in rows]
+            return [lambda row=row: self.action_masks()[row] for row in rows]
         return [getattr(self._batch, attr_name)] * len(rows)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

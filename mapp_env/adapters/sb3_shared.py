@@ -11,7 +11,7 @@ import numpy as np
 import supersuit
 from numpy.typing import NDArray
 
-from mapp_env.adapters.sb3_rows import RowsVecEnv
+from mapp_env.adapters.sb3_rows import RowsVecEnv, Stepped
 from mapp_env.envs.parallel_env import MappParallelEnv
 from mapp_env.envs.vector_env import MAX_ENVS
 from mapp_env.validation import MAX_SEED, check_count, describe
@@ -112,9 +112,7 @@ class SharedVecEnv(RowsVecEnv):
         self._keep_masks(found)
         return np.array(observations)
 
-    def step_wait(
-        self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> Stepped:
         """Move every agent.
 
         Returns

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
-from mapp_env.adapters.sb3_rows import RowsVecEnv
+from mapp_env.adapters.sb3_rows import RowsVecEnv, Stepped
 from mapp_env.engine.seeds import spread_seed
 from mapp_env.engine.sources import check_options
 from mapp_env.envs.central_env import central_action_masks
@@ -75,12 +75,8 @@ class MappSb3VecEnv(RowsVecEnv):
         self._returns = np.zeros(self.engine.num_envs)
         self._lengths = np.zeros(self.engine.num_envs, np.int64)
         self._started = time.perf_counter()
-        super().__init__(
-            self.engine,
-            "engine",
-            self.engine.single_observation_space,
-            self.engine.single_action_space,
-        )
+        spaces = self.engine.single_observation_space, self.engine.single_action_space
+        super().__init__(self.engine, "engine", *spaces)
 
     @property
     def _limited(self) -> list[MappVectorEnv]:
@@ -166,9 +162,7 @@ class MappSb3VecEnv(RowsVecEnv):
         self._lengths[:] = 0
         return observations
 
-    def step_wait(
-        self,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> Stepped:
         """Carry out the joint actions.
 
         Returns
@@ -202,7 +196,7 @@ class MappSb3VecEnv(RowsVecEnv):
         # Columns as lists and dicts written out: this is most of what the adapter costs.
         return [
             {
-                "terminal_observation": observation,
+                "terminal_observation": last,
                 "TimeLimit.truncated": truncated,
                 "is_success": success,
                 "metrics": {
@@ -213,15 +207,11 @@ class MappSb3VecEnv(RowsVecEnv):
                 },
                 "episode": {"r": total, "l": length, "t": seconds},
             }
-            for observation, truncated, success, (
-                cover_time,
-                makespan,
-                distance,
-            ), total, length in zip(
+            for last, truncated, success, cover_time, makespan, distance, total, length in zip(
                 transition.last_observations,
                 transition.truncations[ended].tolist(),
                 np.isfinite(costs[:, 0]).tolist(),
-                costs.tolist(),
+                *costs.T.tolist(),
                 self._returns[ended].tolist(),
                 self._lengths[ended].tolist(),
                 strict=True,

@@ -15,15 +15,18 @@ from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
 from mapp_env.engine.state import Packed, World, new_rows, split, split_row, world_at
 from mapp_env.grid import fill_distances
 
+# Arrays, for signatures of one line.
+Int32s = NDArray[np.int32]
+Int64s = NDArray[np.int64]
+Int8s = NDArray[np.int8]
+Float32s = NDArray[np.float32]
+Float64s = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
 
 @kernel
 def step_and_observe(
-    row: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    max_cycles: int,
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
-    world: Packed,
+    row: Int32s, actions: Int64s, max_cycles: int, views: Float32s, masks: Int8s, world: Packed
 ) -> tuple[float, bool, bool]:
     """Step a single row and observe it; parameters as in ``step_row`` and ``observe_row``.
 
@@ -43,15 +46,15 @@ def step_and_observe(
 
 @kernel
 def step_rows(
-    rows: NDArray[np.int32],
-    actions: NDArray[np.int64],
-    skip: NDArray[np.bool_],
-    limits: NDArray[np.int64],
-    rewards: NDArray[np.float64],
-    terminations: NDArray[np.bool_],
-    truncations: NDArray[np.bool_],
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
+    rows: Int32s,
+    actions: Int64s,
+    skip: Bools,
+    limits: Int64s,
+    rewards: Float64s,
+    terminations: Bools,
+    truncations: Bools,
+    views: Float32s,
+    masks: Int8s,
     world: Packed,
 ) -> None:
     """Step all rows but those of ``skip``, with checked actions; observe all.
@@ -74,11 +77,7 @@ def step_rows(
 
 @kernel
 def observe_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    views: NDArray[np.float32],
-    masks: NDArray[np.int8],
-    world: Packed,
+    rows: Int32s, indices: Int64s, views: Float32s, masks: Int8s, world: Packed
 ) -> None:
     """Observe the rows of ``indices``, (M,): theirs in ``views`` (B, V, F), ``masks`` (B, N, A)."""
     common = World(*world)
@@ -87,13 +86,7 @@ def observe_rows(
 
 
 @kernel
-def reset_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    landmarks: NDArray[np.int32],
-    depot: int,
-    world: Packed,
-) -> None:
+def reset_rows(rows: Int32s, indices: Int64s, landmarks: Int32s, depot: int, world: Packed) -> None:
     """Start an episode in the rows of ``indices``, (M,), on ``landmarks``, (M, K)."""
     common = World(*world)
     for place, index in enumerate(indices):
@@ -101,12 +94,7 @@ def reset_rows(
 
 
 @kernel
-def measure_rows(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    costs: NDArray[np.float64],
-    world: Packed,
-) -> None:
+def measure_rows(rows: Int32s, indices: Int64s, costs: Float64s, world: Packed) -> None:
     """Write the costs of some rows, (M, 3): cover time, makespan, total distance (R8)."""
     common = World(*world)
     for place, index in enumerate(indices):
@@ -117,32 +105,13 @@ def measure_rows(
 
 
 def visit_rows(
-    world: World,
-    cells: NDArray[np.integer],
-    landmarks: NDArray[np.integer],
-    visited: NDArray[np.bool_],
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.bool_]]:
+    world: World, cells: NDArray[np.integer], landmarks: NDArray[np.integer], visited: Bools
+) -> tuple[Bools, Float64s, Bools]:
     """Return what the rules make of agents that have moved, whatever brought them there.
 
-    Parameters
-    ----------
-    world : World
-        Sizes, reward and distances, from :func:`mapp_env.engine.task.make_world`.
-    cells : ndarray of int, shape (B, N)
-        Where the agents stand after the move.
-    landmarks : ndarray of int, shape (B, K)
-        The landmarks' cells.
-    visited : ndarray of bool or int, shape (B, K)
-        Which of them had been visited before.
-
-    Returns
-    -------
-    visited : ndarray of bool, shape (B, K)
-        With those under an agent (R5).
-    rewards : ndarray of float64, shape (B,)
-        The team reward (R6).
-    terminated : ndarray of bool, shape (B,)
-        Whether all are visited (R7).
+    They stand on ``cells``, (B, N), and of ``landmarks``, (B, K), some were ``visited`` before,
+    (B, K), bool or 0 and 1. Returned are those visited now, (B, K) (R5), the team rewards, (B,)
+    (R6), and whether all are visited, (B,) (R7).
     """
     rows = new_rows(len(cells), world.n_agents, world.n_landmarks)
     state = split(rows, world.n_agents, world.n_landmarks)
@@ -153,12 +122,7 @@ def visit_rows(
 
 
 @kernel
-def _visit_rows(
-    rows: NDArray[np.int32],
-    rewards: NDArray[np.float64],
-    terminated: NDArray[np.bool_],
-    world: Packed,
-) -> None:
+def _visit_rows(rows: Int32s, rewards: Float64s, terminated: Bools, world: Packed) -> None:
     common = World(*world)
     for index in range(rows.shape[0]):
         state = split_row(rows[index], common.n_agents, common.n_landmarks)
@@ -167,11 +131,7 @@ def _visit_rows(
 
 @kernel
 def fill_fields(
-    rows: NDArray[np.int32],
-    indices: NDArray[np.int64],
-    fields: NDArray[np.int32],
-    queue: NDArray[np.int32],
-    world: Packed,
+    rows: Int32s, indices: Int64s, fields: Int32s, queue: Int32s, world: Packed
 ) -> None:
     """Write the steps from every landmark of some rows: how grids too large for all pairs do it.
 
@@ -186,7 +146,7 @@ def fill_fields(
 
 
 @kernel
-def fill_joint_mask(masks: NDArray[np.int8], joint: NDArray[np.int8]) -> None:
+def fill_joint_mask(masks: Int8s, joint: Int8s) -> None:
     """Write which numbered joint actions bump no agent, (A**N,), of the agents' masks, (N, A)."""
     n_agents, n_actions = masks.shape
     for action in range(n_actions):
@@ -204,7 +164,7 @@ def fill_joint_mask(masks: NDArray[np.int8], joint: NDArray[np.int8]) -> None:
 
 
 @kernel
-def fill_joint_masks(masks: NDArray[np.int8], joint: NDArray[np.int8]) -> None:
+def fill_joint_masks(masks: Int8s, joint: Int8s) -> None:
     """Do :func:`fill_joint_mask` for every row: ``masks`` (M, N, A) and ``joint`` (M, A**N)."""
     for row in range(masks.shape[0]):
         fill_joint_mask(masks[row], joint[row])

@@ -74,11 +74,9 @@ def view(kind: Observation, grid: Grid, n_agents: int, n_landmarks: int) -> View
         return View(shape, np.zeros(shape, np.float32), np.ones(shape, np.float32))
     if kind == Observation.GEODESIC:
         farthest = grid.n_cells / (grid.rows + grid.cols)
-        low = np.array([0, 0, 0, 0, *[-1] * N_ACTIONS], np.float32)
-        high = np.array([1, farthest, farthest, 1, *[1] * N_ACTIONS], np.float32)
-        return View(
-            (N_FEATURES * n_landmarks,), np.tile(low, n_landmarks), np.tile(high, n_landmarks)
-        )
+        low = np.array([0, 0, 0, 0, *[-1] * N_ACTIONS] * n_landmarks, np.float32)
+        high = np.array([1, farthest, farthest, 1, *[1] * N_ACTIONS] * n_landmarks, np.float32)
+        return View(low.shape, low, high)
     size = state_length(n_agents, n_landmarks)
     high = np.full(size, grid.n_cells - 1, np.float32)
     split(high, n_agents, n_landmarks).visited[:] = 1
@@ -98,18 +96,10 @@ def view_distances(
 def observe_row(
     row: NDArray[np.int32], world: World, views: NDArray[np.float32], masks: NDArray[np.int8]
 ) -> None:
-    """Write the observations and action masks of all agents.
+    """Write the observations, flat, and the action masks of all agents.
 
-    Parameters
-    ----------
-    row : ndarray of int32
-        What is looked at.
-    world : World
-        What is looked up.
-    views : ndarray of float32, shape (V, F)
-        Observations, flat. V is N, or 1 to write ``GLOBAL`` once and not for each agent.
-    masks : ndarray of int8, shape (N, A)
-        Action masks: 0 for a move that would bump, 1 for any other and for waiting.
+    ``views`` is (V, F), V being N, or 1 to write ``GLOBAL`` once and not for each agent;
+    ``masks``, (N, A), become 0 for a move that would bump, 1 for any other and for waiting.
     """
     state = split_row(row, world.n_agents, world.n_landmarks)
     _write_masks(state, world, masks)

@@ -25,38 +25,17 @@ from mapp_env.problem import MAX_CYCLES
 class Rows:
     """The state of B problems of one task.
 
-    Parameters
-    ----------
-    task : Task
-        What is simulated.
-    n_rows : int
-        Number of problems B.
-    n_views : int
-        Observations V of a row: the number of agents, or 1 for the global one once.
-
-    Attributes
-    ----------
-    array : ndarray of int32, shape (B, L)
-        The rows.
-    state : State
-        Their parts by name.
-    world : tuple
-        What the kernels look up, see :data:`mapp_env.engine.state.Packed`.
-    limits : ndarray of int64, shape (B,)
-        Step limit of each row's episode.
-    max_cycles : int
-        Step limit of the episodes to come that do not bring their own.
-    longest : int
-        Upper bound of every step limit, whoever sets it.
+    A row has V observations: ``n_views`` is the number of agents, or 1 for the global one once.
+    ``array``, (B, L) int32, holds the rows, ``state`` names its parts.
     """
 
     def __init__(self, task: Task, n_rows: int, n_views: int) -> None:
         self.task = task
         self.n_rows = n_rows
         self.array = new_rows(n_rows, task.n_agents, task.n_landmarks)
-        self.limits = np.full(n_rows, task.max_cycles, np.int64)
-        self.max_cycles = task.max_cycles
-        self.longest = MAX_CYCLES
+        self.limits = np.full(n_rows, task.max_cycles, np.int64)  # of each row's episode
+        self.max_cycles = task.max_cycles  # of the episodes to come that do not bring their own
+        self.longest = MAX_CYCLES  # upper bound of every step limit, whoever sets it
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
         n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
@@ -82,16 +61,10 @@ class Rows:
     def start(
         self, indices: NDArray[np.int64], landmarks: NDArray[np.int32], limit: int | None = None
     ) -> None:
-        """Start an episode in some rows.
+        """Start an episode in the rows of ``indices``, (M,), on ``landmarks``, (M, K).
 
-        Parameters
-        ----------
-        indices : ndarray of int64, shape (M,)
-            The rows.
-        landmarks : ndarray of int32, shape (M, K)
-            Their landmarks, from :mod:`mapp_env.engine.sources`.
-        limit : int, optional
-            Step limit of these episodes; by default ``max_cycles``.
+        The landmarks come from :mod:`mapp_env.engine.sources`; the step limit is ``max_cycles``
+        unless another ``limit`` is given.
         """
         grid = self.task.grid
         reset_rows(self.array, indices, landmarks, grid.depot, self.world)
@@ -122,21 +95,11 @@ class Rows:
         NDArray[np.float32],
         NDArray[np.int8],
     ]:
-        """Carry out a valid joint action in each row but those to skip, and observe all.
+        """Carry out valid joint actions, (B, N), in each row but those to ``skip``; observe all.
 
-        Parameters
-        ----------
-        actions : ndarray of int64, shape (B, N)
-            One action an agent.
-        skip : ndarray of bool, shape (B,)
-            Rows that stay as they are; their reward is 0 and their flags are down.
-
-        Returns
-        -------
-        rewards, terminations, truncations : ndarray, shape (B,)
-            float64, bool, bool.
-        views, masks : ndarray of float32, shape (B, V, F), and of int8, shape (B, N, A)
-            Fresh observations, flat, and action masks.
+        Rows of ``skip``, (B,), stay as they are: their reward is 0, their flags are down. Returned
+        are fresh rewards, terminations and truncations, (B,), observations, flat, (B, V, F), and
+        action masks, (B, N, A).
 
         Raises
         ------

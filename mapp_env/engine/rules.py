@@ -28,9 +28,7 @@ from mapp_env.engine.state import (
 )
 from mapp_env.grid import FAR, Grid
 
-MAX_TABLE_CELLS = (
-    256  # largest grid for a table of Manhattan distances: it should stay in the cache
-)
+MAX_TABLE_CELLS = 256  # of a grid with a table of Manhattan distances: it should stay in the cache
 
 
 class Reward(IntEnum):
@@ -73,23 +71,10 @@ def reset_row(
 def step_row(
     row: NDArray[np.int32], actions: NDArray[np.int64], max_cycles: int, world: World
 ) -> tuple[float, bool, bool]:
-    """Carry out one joint action.
+    """Carry out a valid joint action, shape (N,), in a row that is changed in place.
 
-    Parameters
-    ----------
-    row : ndarray of int32
-        Changed in place.
-    actions : ndarray of int64, shape (N,)
-        Valid actions, one an agent.
-    max_cycles : int
-        The step limit.
-    world : World
-        What is looked up.
-
-    Returns
-    -------
-    float, bool, bool
-        The team reward (R6), terminated and truncated (R7).
+    Returns the team reward (R6), terminated and truncated, the step limit being ``max_cycles``
+    (R7).
     """
     state = split_row(row, world.n_agents, world.n_landmarks)
     move_row(state, actions, world)
@@ -111,14 +96,11 @@ def move_row(state: State, actions: NDArray[np.int64], world: World) -> None:
 @kernel
 def visit_row(state: State, world: World) -> tuple[float, bool]:
     """Visit the landmarks under agents (R5); return the team reward (R6) and if none is left."""
-    if world.first_field == BY_COORDINATES:
-        unvisited, distance = _visit(
-            state, world, _nearest_by_coordinates, world.table, world.first_field
-        )
+    first = world.first_field
+    if first == BY_COORDINATES:
+        unvisited, distance = _visit(state, world, _nearest_by_coordinates, world.table, first)
     else:
-        unvisited, distance = _visit(
-            state, world, _nearest_by_table, world.distances, world.first_field
-        )
+        unvisited, distance = _visit(state, world, _nearest_by_table, world.distances, first)
     if unvisited == 0:
         return 0.0, True
     if world.reward == Reward.STEP:

@@ -17,17 +17,8 @@ WORDS_AHEAD = 64
 class RowSeeds:
     """A ``numpy.random.Generator`` for each row, seeded as a single environment seeds its own.
 
-    Parameters
-    ----------
-    n_rows : int
-        Number of rows.
-
-    Attributes
-    ----------
-    generators : list of numpy.random.Generator, length B
-        Empty until the first :meth:`seed`. Up to 64 words of each may have been fetched ahead.
-    seeds : list of int, length B
-        The seed of each generator.
+    There are no ``generators`` until the first :meth:`seed`; up to 64 words of each may have been
+    fetched ahead.
     """
 
     def __init__(self, n_rows: int) -> None:
@@ -63,14 +54,9 @@ class RowSeeds:
     def seed(self, seed: int | list[int | None] | None, indices: list[int]) -> None:
         """Give rows new generators: those of ``indices`` as ``seed`` says, all if none has one.
 
-        Parameters
-        ----------
-        seed : int, list or None
-            An int is spread over the rows by ``numpy.random.SeedSequence``: row ``i`` gets the same
-            seed whatever the number of rows, and seeds 0 and 1 have no row in common. A list seeds
-            each row, ``None`` leaves its generator as it is.
-        indices : list of int
-            The rows meant.
+        An int is spread over the rows by ``numpy.random.SeedSequence``: row ``i`` gets the same
+        seed whatever the number of rows, and seeds 0 and 1 have no row in common. A list seeds
+        each row, ``None`` leaves its generator as it is.
         """
         if not self.generators:
             self.generators = [np.random.default_rng(0)] * self.n_rows

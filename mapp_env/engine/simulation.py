@@ -21,25 +21,13 @@ VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # to make them of types 
 class Simulation:
     """A single row, from reset to the end of its episode.
 
-    Parameters
-    ----------
-    task : Task
-        What is simulated.
-    n_views : int
-        Observations V a step: the number of agents, or 1 for the global one once.
-
-    Attributes
-    ----------
-    max_cycles : int
-        Step limit of the episodes to come that do not bring their own.
-    running : bool
-        Whether :meth:`step` may be called.
+    A step has V observations: ``n_views`` is the number of agents, or 1 for the global one once.
     """
 
     def __init__(self, task: Task, n_views: int) -> None:
         self.task = task
-        self.max_cycles = task.max_cycles
-        self.running = False
+        self.max_cycles = task.max_cycles  # of the episodes to come that do not bring their own
+        self.running = False  # whether step() may be called
         self._rows = Rows(task, 1, n_views)
         self._limit = task.max_cycles
         self._views_shape, self._masks_shape = self._rows.views_shape, self._rows.masks_shape
@@ -72,24 +60,11 @@ class Simulation:
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[float, bool, bool, NDArray[np.float32], NDArray[np.int8]]:
-        """Carry out a valid joint action.
+        """Carry out a joint action, shape (N,).
 
-        Parameters
-        ----------
-        actions : ndarray of int64, shape (N,)
-            One action an agent.
-
-        Returns
-        -------
-        reward, terminated, truncated : float, bool, bool
-            Of the team (R6, R7).
-        views, masks : ndarray of float32, shape (V, ...), and of int8, shape (N, A)
-            Fresh observations and action masks.
-
-        Raises
-        ------
-        ValueError
-            If an action is not valid; nothing has moved then.
+        Returns the team's reward, terminated and truncated (R6, R7), and fresh observations, shape
+        (V, ...), and action masks, shape (N, A). Raises a ValueError if an action is not valid;
+        nothing has moved then.
         """
         views = np.empty(self._views_shape, VIEWS)
         masks = np.empty(self._masks_shape, MASKS)
@@ -124,13 +99,7 @@ class Simulation:
 
 
 def metrics_of(costs: NDArray[np.float64]) -> dict[str, bool | float]:
-    """Return the metrics of an episode by name.
-
-    Parameters
-    ----------
-    costs : ndarray of float64, shape (3,)
-        Cover time, makespan and total distance, inf if not every landmark was visited.
-    """
+    """Return by name cover time, makespan and total distance, inf if not solved, shape (3,)."""
     cover_time, makespan, total_distance = costs.tolist()
     return {
         "success": cover_time != np.inf,

@@ -85,10 +85,8 @@ def check_problems(
 ) -> tuple[NDArray[np.int32] | None, int | None]:
     """Return the landmarks that a batch is reset on, shape (B, K), and the step limit.
 
-    Both are None if nothing is asked for.
-
-    Raises a ValueError if the options are invalid, or their problem is not of the task's grid and
-    sizes.
+    Both are None if nothing is asked for. Raises a ValueError if the options are invalid, or their
+    problem is not of the task's grid and sizes.
     """
     landmarks = None if options is None else options.get("landmarks")
     if isinstance(landmarks, np.ndarray) and landmarks.ndim > 1:

@@ -15,12 +15,7 @@ from mapp_env.engine.rules import Reward, reward_distances
 from mapp_env.engine.state import N_ACTIONS, NO_DISTANCES, World, cell_table
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.grids import find_grid
-from mapp_env.problem import (
-    MAX_AGENTS,
-    MAX_CYCLES,
-    MAX_LANDMARKS,
-    check_grid,
-)
+from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, MAX_LANDMARKS, check_grid
 from mapp_env.validation import check_choice, check_count, check_flag
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
@@ -138,14 +133,8 @@ class Task:
 
     def world(self, fields: NDArray[np.int32]) -> World:
         """Return what the kernels look up; ``fields`` as in :func:`make_world`."""
-        return make_world(
-            self.grid,
-            self.n_agents,
-            self.n_landmarks,
-            self.reward_kind,
-            self.observation_kind,
-            fields,
-        )
+        sizes = self.n_agents, self.n_landmarks
+        return make_world(self.grid, *sizes, self.reward_kind, self.observation_kind, fields)
 
     def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
         """Check that the arrays for a number of rows fit in memory.
@@ -184,23 +173,9 @@ def make_world(
 ) -> World:
     """Return what the rules look up on a grid; sizes are not checked here.
 
-    Parameters
-    ----------
-    grid : Grid
-        The grid.
-    n_agents, n_landmarks : int
-        Agents N and landmarks K.
-    reward : Reward
-        The team reward.
-    observation : Observation
-        The observation kind.
-    fields : ndarray of int32, shape (B * K, C), or empty
-        Where shortest paths from the rows' landmarks will stand; empty: those of all pairs do.
-
-    Raises
-    ------
-    ValueError
-        If shortest paths are looked up, without fields, on a grid too large for all pairs.
+    ``fields``, shape (B * K, C), is where shortest paths from the rows' landmarks will stand; if it
+    is empty, those of all pairs do. Raises a ValueError if shortest paths are looked up, without
+    fields, on a grid too large for all pairs.
     """
     return World(
         n_agents,

@@ -24,14 +24,7 @@ except ImportError:  # Gymnasium 1.0 has the next-step mode alone, and no name f
         DISABLED = "Disabled"
 
 
-__all__ = [
-    "BATCH_RENDER_MODES",
-    "AutoresetMode",
-    "BatchTask",
-    "CentralTask",
-    "TupleTask",
-    "takes",
-]
+__all__ = ["BATCH_RENDER_MODES", "AutoresetMode", "BatchTask", "CentralTask", "TupleTask", "takes"]
 
 CENTRAL_ACTIONS = ("auto", "joint", "multi")
 BATCH_RENDER_MODES = ("rgb_array", "ansi")
@@ -89,12 +82,7 @@ class _Taking(Protocol[P, T]):
 def takes(task: Callable[P, T]) -> _Taking[P, T]:
     """Let an ``__init__`` whose last argument is a task take what the task is made from instead.
 
-    Signature, help and positional use are as if the fields were written out.
-
-    Parameters
-    ----------
-    task : type
-        A :class:`~mapp_env.engine.task.Task`, or a subclass with other fields or defaults.
+    Signature, help and positional use are as if the fields of the class ``task`` were written out.
     """
 
     def decorate(init: Callable[..., None]) -> Any:

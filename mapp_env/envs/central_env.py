@@ -24,21 +24,8 @@ def central_action_space(
 ) -> tuple[Discrete[np.int64] | MultiDiscrete, NDArray[np.int64] | None]:
     """Return the meta-agent's action space and, for numbered joint actions, their table.
 
-    Parameters
-    ----------
-    task : CentralTask
-        ``central_action="joint"`` numbers the joint actions, the first agent most significant;
-        ``"multi"`` takes one action an agent; ``"auto"`` is joint up to six agents.
-
-    Returns
-    -------
-    Discrete or MultiDiscrete, and ndarray of int64, shape (A**N, N), or None
-        The space; the table holds each agent's action for each joint action.
-
-    Raises
-    ------
-    ValueError
-        If joint actions are asked for more than six agents.
+    The table, shape (A**N, N), holds each agent's action for each joint action, the first agent
+    most significant. Raises a ValueError if joint actions are asked for more than six agents.
     """
     n_agents, n_actions, central_action = task.n_agents, task.n_actions, task.central_action
     if central_action == "joint" and n_agents > MAX_JOINT_AGENTS:
@@ -55,19 +42,10 @@ def central_action_space(
 def central_action_masks(
     masks: NDArray[np.int8], joint_actions: NDArray[np.int64] | None
 ) -> NDArray[np.bool_]:
-    """Return which of the meta-agent's actions bump no agent.
+    """Return which of the meta-agent's actions bump no agent, by the agents' masks, (B, N, A).
 
-    Parameters
-    ----------
-    masks : ndarray of int8, shape (B, N, A)
-        The agents' action masks.
-    joint_actions : ndarray of int64, shape (A**N, N), or None
-        What :func:`central_action_space` returns.
-
-    Returns
-    -------
-    ndarray of bool, shape (B, A**N) or, without numbered joint actions, (B, N * A)
-        Of every joint action, or of each agent's actions one agent after the other.
+    With the table of :func:`central_action_space`, these are the joint actions, (B, A**N); without
+    it, each agent's actions, one agent after the other, (B, N * A).
     """
     if joint_actions is None:
         return masks.astype(np.bool_).reshape(len(masks), -1)
@@ -121,7 +99,7 @@ class CentralEnv(SimulationEnv):
             If seed or options cannot be used.
         """
         views, masks = self._start(seed, options)
-        return self._observation(views), self._find_info(masks)
+        return views[0] if self._once else views, self._find_info(masks)
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Carry out a joint action.
@@ -137,19 +115,13 @@ class CentralEnv(SimulationEnv):
         info = self._find_info(masks)
         if terminated or truncated:
             info["metrics"] = self._simulation.metrics()
-        return self._observation(views), reward, terminated, truncated, info
+        return views[0] if self._once else views, reward, terminated, truncated, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
 
-        Returns
-        -------
-        ndarray of bool, shape (A**N,) or, with ``MultiDiscrete`` actions, (N * A,)
-
-        Raises
-        ------
-        gymnasium.error.ResetNeeded
-            Before the first reset.
+        The shape is (A**N,) or, with ``MultiDiscrete`` actions, (N * A,). Raises a ResetNeeded
+        before the first reset.
         """
         if not self._started:
             raise ResetNeeded("action_masks() needs an episode: call reset() first")
@@ -177,7 +149,3 @@ class CentralEnv(SimulationEnv):
             joint: NDArray[np.int64] = self._joint_actions[number]
             return joint
         return super()._read_action(action)
-
-    def _observation(self, views: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the meta-agent's observation of the agents' views, shape (V, ...)."""
-        return views[0] if self._once else views

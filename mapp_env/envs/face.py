@@ -21,15 +21,7 @@ from mapp_env.validation import MAX_SEED, as_integer, check_count, describe
 
 
 class Face:
-    """An environment over one simulation.
-
-    Parameters
-    ----------
-    task : Task
-        What is simulated.
-    n_views : int
-        Observations V a step: the number of agents, or 1 for the global one once.
-    """
+    """An environment over one simulation; ``task`` and ``n_views`` are the simulation's."""
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 5}  # noqa: RUF012
     _np_random: np.random.Generator | None = None

@@ -24,7 +24,7 @@ from mapp_env.envs.central_env import CentralEnv, central_action_space
 from mapp_env.envs.vector_infos import Transition, add_joint_masks, make_infos
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
-from mapp_env.validation import check_count
+from mapp_env.validation import as_array, check_count
 
 MAX_ENVS = 1 << 20
 
@@ -230,17 +230,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             if restarted:
                 self._draw(ended)
                 self._rows.observe_again(ended, views, masks)
-        return Transition(
-            observations,
-            rewards,
-            terminations,
-            truncations,
-            masks,
-            self._ended.copy(),
-            ended,
-            *endings,
-            restarted,
-        )
+        found = observations, rewards, terminations, truncations, masks, self._ended.copy(), ended
+        return Transition(*found, *endings, restarted)
 
     def _draw(self, indices: NDArray[np.int64]) -> None:
         """Start an episode on a random problem in some rows."""
@@ -250,10 +241,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         """Return each agent's action in each row, shape (B, N)."""
         joint = self.joint_actions is not None
         shape = (self.num_envs,) if joint else (self.num_envs, self.task.n_agents)
-        try:
-            array = np.asarray(actions)
-        except ValueError:
-            array = np.array(None)  # ragged
+        array = as_array(actions)
         if array.shape != shape or array.dtype.kind not in "iu":
             raise ValueError(
                 f"actions must be integers of shape {shape}, "
@@ -323,21 +311,12 @@ def make_gymnasium_vec(
 ) -> MappVectorEnv:
     """Return what ``gymnasium.make_vec("mapp_env/Central-v0")`` means: the single one's actions.
 
-    Parameters
-    ----------
-    num_envs : int
-        Number of rows, 1 to 1,048,576.
-    max_episode_steps : int, optional
-        Step at which every episode is truncated that goes on so long, as Gymnasium's ``TimeLimit``
-        does it; None or -1 for the environment's own limits alone. Such an episode has metrics like
-        any other, and one that is solved at that very step is terminated only (R7).
-    **arguments
-        Those of :class:`MappVectorEnv`, but that ``central_action`` is ``"auto"`` by default.
+    Arguments are those of :class:`MappVectorEnv`, but that ``central_action`` is ``"auto"`` by
+    default. At ``max_episode_steps``, unless None or -1, every episode is truncated that goes on so
+    long, as Gymnasium's ``TimeLimit`` does it. Such an episode has metrics like any other, and one
+    that is solved at that very step is terminated only (R7).
 
-    Raises
-    ------
-    ValueError
-        If an argument is invalid.
+    Raises a ValueError if an argument is invalid.
     """
     envs = MappVectorEnv(num_envs, **{"central_action": "auto", **arguments})
     if max_episode_steps not in (None, -1):

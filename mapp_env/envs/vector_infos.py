@@ -29,12 +29,7 @@ class Transition(NamedTuple):
 def make_infos(transition: Transition, n_joint_actions: int) -> dict[str, Any]:
     """Return the infos of a step as ``gymnasium.vector.SyncVectorEnv`` gives them.
 
-    Parameters
-    ----------
-    transition : Transition
-        The step.
-    n_joint_actions : int
-        Number of joint actions A**N if rows take their numbers, else 0.
+    ``n_joint_actions`` is A**N if rows take numbers of joint actions, else 0.
     """
     infos: dict[str, Any] = {}
     if len(transition.ended) and transition.restarted:

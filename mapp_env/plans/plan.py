@@ -117,7 +117,10 @@ class Plan:
         actions = np.array(self.actions, np.int64).reshape(-1, len(self.tours))
         if allow_wait:
             for agent, steps in enumerate(self.claim_steps):
-                actions[self._step_home(agent, steps) :, agent] = WAIT
+                home = 0  # when it is there, if it goes there after its last claim
+                if steps:
+                    home = steps[-1] + self.tours[agent][::-1].index(self.claims[agent][-1])
+                actions[home:, agent] = WAIT
             return actions
         if (actions == WAIT).any():
             step, agent = np.argwhere(actions == WAIT)[0].tolist()
@@ -125,14 +128,6 @@ class Plan:
                 f"joint_actions(allow_wait=False): agent {agent} of this plan waits at step {step}"
             )
         return actions
-
-    def _step_home(self, agent: int, steps: tuple[int, ...]) -> int:
-        """Return when an agent is home, if it goes there after its last claim."""
-        if not steps:
-            return 0
-        tour = self.tours[agent]
-        last = self.claims[agent][-1]
-        return steps[-1] + tour[::-1].index(last)
 
     # -- checking it -------------------------------------------------------------------
 
@@ -174,7 +169,7 @@ class Plan:
         check_tours(problem, self.tours)
         if actions is None and not self.actions and any(self.tours):
             actions = walk_tours(problem, self.tours)
-        if actions is None:
+        elif actions is None:
             actions = check_joint_actions(self.actions, problem.n_agents)
         episode = play_episode(replace(problem, max_cycles=None), actions)
         for name in (*OBJECTIVES, "claims", "tours"):

@@ -31,16 +31,10 @@ class Episode(NamedTuple):
 
 
 def play_episode(problem: Problem, actions: NDArray[np.int64]) -> Episode:
-    """Carry out joint actions until every landmark is visited or the problem's step limit.
+    """Carry out joint actions, shape (T, N), until every landmark is visited or the step limit.
 
-    The last episode is kept: who checks, saves or draws a plan asks for the same once more.
-
-    Parameters
-    ----------
-    problem : Problem
-        What is played; without a step limit all joint actions may be carried out.
-    actions : ndarray of int64, shape (T, N)
-        From :func:`check_joint_actions`.
+    The limit is the problem's, if it has one; actions are as :func:`check_joint_actions` says. The
+    last episode is kept: who checks, saves or draws a plan asks for the same once more.
     """
     return _play(problem, actions.tobytes())
 
@@ -48,8 +42,8 @@ def play_episode(problem: Problem, actions: NDArray[np.int64]) -> Episode:
 @lru_cache(maxsize=1)
 def _play(problem: Problem, data: bytes) -> Episode:
     # Copied, as numba would compile a second version of the kernel for read-only actions.
-    actions = np.frombuffer(data, np.int64).reshape(-1, problem.n_agents).copy()
-    actions = actions[: problem.max_cycles]
+    actions = np.frombuffer(data, np.int64).reshape(-1, problem.n_agents)[: problem.max_cycles]
+    actions = actions.copy()
     n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
     world = make_world(problem.grid, n_agents, n_landmarks)
     row = new_rows(1, n_agents, n_landmarks)[0]
@@ -66,11 +60,9 @@ def _play(problem: Problem, data: bytes) -> Episode:
             claims[agent].append(cell)
             claim_steps[agent].append(step)
     costs = measure_row(row, world)
+    tours = (_tour(problem.grid, cells[:, n], claim_steps[n]) for n in range(n_agents))
     return Episode(
-        tuple(
-            _tour(problem.grid, cells[:, agent], steps_of)
-            for agent, steps_of in enumerate(claim_steps)
-        ),
+        tuple(tours),
         tuple(map(tuple, claims)),
         tuple(map(tuple, claim_steps)),
         tuple(map(tuple, actions[:steps].tolist())),
@@ -95,20 +87,10 @@ def play_row(
     visits: NDArray[np.int64],
     world: Packed,
 ) -> int:
-    """Step a row through joint actions, and return how many were carried out.
+    """Step a row that was reset through joint actions (T, N); return how many were carried out.
 
-    Parameters
-    ----------
-    row : ndarray of int32
-        At reset; changed in place.
-    actions : ndarray of int64, shape (T, N)
-        The joint actions.
-    cells : ndarray of int32, shape (T + 1, N)
-        Where the agents are after each step.
-    visits : ndarray of int64, shape (K,)
-        Zero on entry; the step at which each landmark is visited.
-    world : tuple
-        What is looked up.
+    Written are where the agents are after each step, ``cells`` (T + 1, N), and the step at which
+    each landmark is visited, ``visits`` (K,), zero on entry.
     """
     own = World(*world)
     state = split_row(row, own.n_agents, own.n_landmarks)

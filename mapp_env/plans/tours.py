@@ -34,16 +34,8 @@ def walk_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> NDArray[np.i
     tour follows the first step of one before it that has one (without such an agent it waits,
     action 4), so idle agents should come last.
 
-    Parameters
-    ----------
-    problem : Problem
-        What is played; its step limit is ignored.
-    tours : sequence of sequence of int
-        For each agent its cells from depot to depot, or nothing; neighbours in turn.
-
-    Returns
-    -------
-    ndarray of int64, shape (T, N)
+    Tours are cells from depot to depot, neighbours in turn, or nothing; the result has shape
+    (T, N). The problem's step limit is ignored.
     """
     grid = problem.grid
     # Who comes by each landmark first, and when; in one step, the agent of the lowest index.
