@@ -59,6 +59,9 @@ class Observation(IntEnum):
     GEODESIC = 3
 
 
+PATH_OBSERVATIONS = (Observation.GEODESIC,)  # those that look up shortest paths
+
+
 class View(NamedTuple):
     """Shape and bounds of one agent's observation."""
 
@@ -87,7 +90,7 @@ def view_distances(
     kind: Observation, grid: Grid, fields: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], int]:
     """Return the distances that an observation looks up, as ``rules.reward_distances`` does."""
-    if kind == Observation.GEODESIC:
+    if kind in PATH_OBSERVATIONS:
         return path_distances(grid, fields)
     return NO_DISTANCES, ALL_PAIRS
 

@@ -39,6 +39,9 @@ class Reward(IntEnum):
     STEP = 2
 
 
+PATH_REWARDS = (Reward.GEODESIC,)  # those that look up shortest paths
+
+
 def reward_distances(
     kind: Reward, grid: Grid, fields: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], int]:
@@ -46,7 +49,7 @@ def reward_distances(
 
     Parameters are those of :func:`mapp_env.engine.task.make_world`.
     """
-    if kind == Reward.GEODESIC:
+    if kind in PATH_REWARDS:
         return path_distances(grid, fields)
     if grid.n_cells > MAX_TABLE_CELLS:
         return NO_DISTANCES, BY_COORDINATES

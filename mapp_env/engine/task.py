@@ -10,8 +10,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.engine.observation import Observation, View, view, view_distances
-from mapp_env.engine.rules import Reward, reward_distances
+from mapp_env.engine.observation import PATH_OBSERVATIONS, Observation, View, view, view_distances
+from mapp_env.engine.rules import PATH_REWARDS, Reward, reward_distances
 from mapp_env.engine.state import N_ACTIONS, NO_DISTANCES, World, cell_table
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.grids import find_grid
@@ -128,7 +128,7 @@ class Task:
     @property
     def needs_fields(self) -> bool:
         """Whether paths are kept for each landmark, the grid being too large for all pairs."""
-        wanted = "geodesic" in (self.reward, self.observation)
+        wanted = self.reward_kind in PATH_REWARDS or self.observation_kind in PATH_OBSERVATIONS
         return wanted and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
 
     def world(self, fields: NDArray[np.int32]) -> World:
