@@ -30,25 +30,13 @@ def check_file(option: str, out: str) -> str:
 def picture_writer(
     option: str, out: str, fps: float | None = None
 ) -> Callable[[Problem, Plan], int]:
-    """Return what draws a plan into a file, and says how many bytes that took.
+    """Return what draws a plan into the file ``out``, and says how many bytes that took.
 
-    What stands in the way is said here, before anybody searches for a plan.
+    What stands in the way is said here, before anybody searches for a plan. ``option`` is what
+    messages call the file; ``fps``, frames a second, is for animations.
 
-    Parameters
-    ----------
-    option : str
-        What messages call the file.
-    out : str
-        The file: .gif for an animation; .png, .svg or .pdf for a figure.
-    fps : float, optional
-        Frames a second of an animation.
-
-    Raises
-    ------
-    ValueError
-        If nothing can be drawn there.
-    ImportError
-        If it is a figure and matplotlib is not there.
+    Raises a ValueError if nothing can be drawn there; an ImportError if it is a figure and
+    matplotlib is not there.
     """
     suffix = os.path.splitext(out)[1].lower()
     if suffix not in PICTURES:

@@ -34,22 +34,13 @@ class Policy(Protocol):
 
 
 def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
-    """Return what a loader makes of a policy's name.
+    """Return what a loader, written ``MODULE:FUNCTION``, makes of a policy's name.
 
-    Parameters
-    ----------
-    name : str
-        Of the policy, as the loader knows it.
-    loader : str
-        ``MODULE:FUNCTION``. While another than the default one loads, it and what it imports may
-        also lie in the working directory, if nowhere else.
+    While another than the default one loads, it and what it imports may also lie in the working
+    directory, if nowhere else.
 
-    Raises
-    ------
-    ValueError
-        If the loader is not written so, fails on the name, or returns no policy.
-    ImportError
-        If there is no such loader.
+    Raises a ValueError if the loader is not written so, fails on the name or returns no policy; an
+    ImportError if there is no such loader.
     """
     module, _, function = loader.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), function)):

@@ -48,37 +48,34 @@ MAX_STEPS = 1_999  # an animation may have one frame more
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "--out",
         required=True,
         metavar="FILE",
         help=f"where to draw: {', '.join(PICTURES)}; all but an animation need matplotlib",
     )
-    parser.add_argument(
+    add(
         "--plan",
         metavar="PLAN",
         help="what is played: optimum (proven up to 20 landmarks, else the best found), random, "
         "or a plan file, which brings its problem along (default optimum)",
     )
-    parser.add_argument(
-        "--policy", metavar="NAME", help="in place of a plan: a trained policy that plays"
-    )
-    parser.add_argument(
+    add("--policy", metavar="NAME", help="in place of a plan: a trained policy that plays")
+    add(
         "--policy-loader",
         metavar="MODULE:FUNCTION",
         help="what turns the name into something with act(observations (B, N + 2K)) -> actions "
         f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
     )
-    parser.add_argument(
-        "--objective", choices=OBJECTIVES, help="what the optimum minimises (default cover_time)"
-    )
-    parser.add_argument(
+    add("--objective", choices=OBJECTIVES, help="what the optimum minimises (default cover_time)")
+    add(
         "--max-cycles",
         type=int,
         metavar="T",
         help=f"steps of random or of a policy at most (default {STEPS})",
     )
-    parser.add_argument(
+    add(
         "--fps", type=float, metavar="F", help=f"frames a second of a GIF (default {DEFAULT_FPS:g})"
     )
     add_json_option(parser)
@@ -88,12 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Draw, and print what was written and what the plan costs.
 
-    Raises
-    ------
-    ValueError
-        If an option cannot be used, or the file cannot be written.
-    ImportError
-        If a library that was asked for is not there.
+    Raises a ValueError if an option cannot be used or a file cannot be written; an ImportError if a
+    library that was asked for is not there.
     """
     draw = picture_writer("--out", arguments.out, arguments.fps)
     problem, plan = _plan_of(arguments)

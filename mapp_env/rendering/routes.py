@@ -144,8 +144,7 @@ def _draw_arrows(ax: Axes, route: _Route, width: float, points: float) -> None:
         )
     for (sign, colour), places in heads.items():
         ax.plot(
-            [across for across, _ in places],
-            [down for _, down in places],
+            *zip(*places, strict=True),
             marker=sign,
             markersize=size,
             color=colour,

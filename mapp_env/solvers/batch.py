@@ -202,12 +202,7 @@ def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
 
 @kernel
 def solve_rows(
-    distances: Steps,
-    rows: NDArray[Any],
-    teams: int,
-    closed: bool,
-    optimum: Steps,
-    workspace: Workspace,
+    distances: Steps, rows: Steps, teams: int, closed: bool, optimum: Steps, workspace: Workspace
 ) -> None:
     """Fill in the ``optimum``, shape (p,), of each row of landmarks' nodes, shape (p, K).
 

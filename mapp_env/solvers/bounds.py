@@ -24,9 +24,8 @@ SCALE = 1 << 10
 def lower_bound(problem: Problem, objective: str, distances: Steps) -> int:
     """Return a cost that no plan of a problem can beat; up to 12 landmarks it is the optimum.
 
-    ``distances`` are from :func:`~mapp_env.solvers.solution.landmark_distances`.
-
-    Raises a ValueError if the objective is unknown.
+    ``distances`` are :func:`~mapp_env.solvers.solution.landmark_distances`. Raises a ValueError if
+    the objective is unknown.
     """
     check_choice("objective", objective, OBJECTIVES)
     teams, closed = team_of(objective, problem.n_agents, len(distances) - 1)
@@ -87,20 +86,12 @@ def subset_bound(distances: Steps, teams: int, closed: bool, low: int) -> int:
 def ascend(distances: Steps, closed: bool, n_agents: int, nodes: NDArray[np.int64]) -> int:
     """Raise node penalties by subgradient steps; return the best bound found, times ``SCALE``.
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (n, n), n >= 3
-        Node 0 is the depot.
-    closed : bool
-        Bound one closed tour (1-trees: every degree is 2), or the open routes of a team (trees:
-        no degree above 2, the depot's not above ``n_agents``).
-    n_agents : int
-        Number of agents.
-    nodes : ndarray of int64, shape (4, n)
-        The penalties, zero on entry, and scratch space for :func:`span`.
+    ``distances`` are of at least 3 nodes, the depot first; ``closed`` bounds one closed tour
+    (1-trees: every degree is 2), else the open routes of a team (trees: no degree above 2, the
+    depot's not above ``n_agents``). ``nodes``, shape (4, n), holds the penalties, zero on entry,
+    and what :func:`span` works with.
     """
-    penalties = nodes[0]
-    degrees = nodes[3]
+    penalties, degrees = nodes[0], nodes[3]
     n_nodes = distances.shape[0]
     best = 0
     stride = 0
@@ -133,8 +124,7 @@ def span(distances: Steps, closed: bool, nodes: NDArray[np.int64]) -> int:
     root = 1 if closed else 0
     total = 0
     degrees[:] = 0
-    for node in range(root, n_nodes):
-        reach[node] = UNBOUNDED
+    reach[root:] = UNBOUNDED
     reach[root] = 0
     links[root] = root
     for _ in range(root, n_nodes):

@@ -41,26 +41,10 @@ def solve_pyvrp(
 ) -> Solution:
     """Return short routes found by PyVRP, proven optimal where they meet a lower bound.
 
-    Parameters
-    ----------
-    problem, objective, on_better
-        As for :func:`~mapp_env.solvers.search.solve_search`.
-    time_limit : float, optional
-        Seconds; by default 2. PyVRP builds at least one plan, however few they are.
-    seed : int
-        Of the search, which is bounded by time, so the answer depends on the machine as well.
+    As :func:`~mapp_env.solvers.search.solve_search`, but it is bounded by time alone, 2 seconds by
+    default, so that the answer depends on the machine as well as on the ``seed``.
 
-    Returns
-    -------
-    Solution
-        The search ends early when the cost meets the bound.
-
-    Raises
-    ------
-    ImportError
-        If PyVRP is not installed.
-    ValueError
-        If ``objective`` is unknown.
+    Raises an ImportError if PyVRP is not installed, a ValueError if ``objective`` is unknown.
     """
     pyvrp = import_pyvrp()
     deadline = clock() + (DEFAULT_SECONDS if time_limit is None else time_limit)

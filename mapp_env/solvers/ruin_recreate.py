@@ -59,7 +59,7 @@ class Scratch(NamedTuple):
     """What one iteration needs."""
 
     holder: NDArray[np.int64]  # (K + 1,), the agent that visits a node, -1 if none
-    removed: NDArray[np.int64]  # (K,)
+    removed: NDArray[np.int64]  # (K,), at first every landmark
     keys: NDArray[np.int64]  # (K,)
     touched: NDArray[np.bool_]  # (N,), whether a route differs from the one before
 
@@ -92,11 +92,8 @@ def improve(
             heat[NOW] = heat[WARMEST]
             heat[FALL] = math.exp(math.log(heat[COLDEST] / heat[WARMEST]) / memory[CYCLE])
             memory[CYCLE] *= 2
-        if memory[DONE] == 0:
-            count = layout.near.shape[1]
-            for index in range(count):
-                scratch.removed[index] = index + 1
-        else:
+        count = layout.near.shape[1]
+        if memory[DONE] > 0:
             count = ruin(layout, trial, scratch, memory)
         sort_removed(count, layout, scratch, memory)
         recreate(count, layout, trial, scratch, memory)
@@ -132,10 +129,7 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
     n_landmarks = layout.near.shape[1]
     wanted = min(1 + draw(memory, 2 * MEAN_REMOVED), n_landmarks)
     if layout.weight > 0 and draw(memory, 100) < LONGEST_PERCENT:
-        longest = 0
-        for agent in range(team.sizes.shape[0]):
-            if team.lengths[agent] > team.lengths[longest]:
-                longest = agent
+        longest = team.lengths.argmax()
         middle = int(team.routes[longest, draw(memory, team.sizes[longest])])
     else:
         middle = 1 + draw(memory, n_landmarks)
@@ -149,8 +143,7 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
             continue
         route = team.routes[agent]
         size = team.sizes[agent]
-        string = 1 + draw(memory, min(MAX_STRING, size))
-        string = min(string, wanted - count)
+        string = min(1 + draw(memory, min(MAX_STRING, size)), wanted - count)
         place = 0
         while route[place] != node:
             place += 1
@@ -210,9 +203,7 @@ def recreate(
     """Insert what was removed, each where it costs least, a few places being overlooked."""
     n_routes = team.sizes.shape[0]
     distances = layout.distances
-    top = 0
-    for agent in range(n_routes):
-        top = max(top, team.lengths[agent])
+    top = team.lengths[team.lengths.argmax()]
     blink = 1 + draw(memory, 2 * MEAN_BLINK)
     for index in range(count):
         node = scratch.removed[index]
@@ -261,26 +252,19 @@ def recreate(
 @kernel
 def cost_of(layout: Layout, team: Team) -> int:
     """Return what the search minimises."""
-    top = 0
-    total = 0
-    for agent in range(team.sizes.shape[0]):
-        top = max(top, team.lengths[agent])
-        total += team.lengths[agent]
-    return int(layout.weight * top + total)
+    longest = team.lengths[team.lengths.argmax()]
+    return int(layout.weight * longest + team.lengths.sum())
 
 
 @kernel
 def record(layout: Layout, team: Team, best: Team, memory: NDArray[np.int64]) -> None:
     """Keep a team that is better in the objective, or as good and shorter in all."""
-    top = 0
-    total = 0
+    total = team.lengths.sum()
     for agent in range(team.sizes.shape[0]):
-        size = team.sizes[agent]
-        top = max(top, team.lengths[agent])
-        if size > 0:
-            last = team.routes[agent, size - 1]
-            total += team.lengths[agent] - layout.back[last] + layout.distances[0, last]
-    primary = top if layout.weight > 0 else total
+        if team.sizes[agent] > 0:
+            last = team.routes[agent, team.sizes[agent] - 1]
+            total += layout.distances[0, last] - layout.back[last]
+    primary = team.lengths[team.lengths.argmax()] if layout.weight > 0 else total
     if primary < memory[BEST] or (primary == memory[BEST] and total < memory[BEST_TOTAL]):
         memory[BEST] = primary
         memory[BEST_TOTAL] = total
