@@ -17,10 +17,7 @@ DEFAULT_FPS = 4.0
 
 
 def check_file(option: str, out: str) -> str:
-    """Return what a path leads to, if a file could be written there.
-
-    Raises a ValueError if none could; the message names the option.
-    """
+    """Return what a path leads to; raise ValueError, for the option, if no file can be there."""
     try:
         return check_writable(out)
     except ValueError as error:
@@ -44,18 +41,16 @@ def picture_writer(
     if suffix in FIGURES and fps is not None:
         raise ValueError("--fps is for animations: it does not go with a figure")
     check_file(option, out)
-    if suffix in FIGURES:
-        from mapp_env.rendering import draw_plan, save_figure
-
-        def draw_figure(problem: Problem, plan: Plan) -> int:
-            figure: Any = draw_plan(problem, plan).figure  # as no axes were given, all of one
-            return save_figure(figure, out)
-
-        return draw_figure
-
-    def animate(problem: Problem, plan: Plan) -> int:
+    if suffix in ANIMATIONS:
         from mapp_env.rendering import save_animation
 
-        return save_animation(out, problem, plan.actions, DEFAULT_FPS if fps is None else fps)
+        rate = DEFAULT_FPS if fps is None else fps
+        return lambda problem, plan: save_animation(out, problem, plan.actions, rate)
 
-    return animate
+    from mapp_env.rendering import draw_plan, save_figure
+
+    def draw_figure(problem: Problem, plan: Plan) -> int:
+        figure: Any = draw_plan(problem, plan).figure  # as no axes were given, all of one
+        return save_figure(figure, out)
+
+    return draw_figure

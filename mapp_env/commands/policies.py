@@ -115,20 +115,14 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     observation, _ = env.reset(seed=0, options={"landmarks": problem.landmarks})
     actions, over = [], False
     while not over:
-        actions.append(_act(policy, observation, problem.n_agents))
+        with _refusing("--policy cannot play this problem"):
+            found = np.asarray(policy.act(observation[None]))
+        if found.shape != (1, problem.n_agents) or found.dtype.kind not in "iu":
+            raise ValueError(
+                f"--policy must act with integers of shape (1, {problem.n_agents}), got shape "
+                f"{found.shape}, dtype {found.dtype}"
+            )
+        actions.append(found[0].astype(np.int64))
         observation, _, terminated, truncated, _ = env.step(actions[-1])
         over = terminated or truncated
     return replay(replace(problem, max_cycles=max_cycles), np.array(actions))
-
-
-def _act(policy: Policy, observation: NDArray[np.float32], n_agents: int) -> NDArray[np.int64]:
-    """Return a policy's joint action, shape (N,)."""
-    with _refusing("--policy cannot play this problem"):
-        found = np.asarray(policy.act(observation[None]))
-    if found.shape != (1, n_agents) or found.dtype.kind not in "iu":
-        raise ValueError(
-            f"--policy must act with integers of shape (1, {n_agents}), got shape {found.shape}, "
-            f"dtype {found.dtype}"
-        )
-    actions: NDArray[np.int64] = found[0].astype(np.int64)
-    return actions

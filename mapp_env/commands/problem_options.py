@@ -86,10 +86,7 @@ def seed_of(arguments: argparse.Namespace) -> int:
 
 
 def refuse_problem_options(arguments: argparse.Namespace, reason: str, but: str = "") -> None:
-    """Refuse options that another source of the problem, named in `but`, leaves without effect.
-
-    Raises a ValueError if one of them was given.
-    """
+    """Raise ValueError if an option other than ``but`` was given: none goes with ``reason``."""
     for name in OPTIONS:
         if name != but and getattr(arguments, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} does not go with {reason}")

@@ -46,10 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Solve all problems, and print what their optima are.
-
-    Raises a ValueError if there is no such universe, or it is too large.
-    """
+    """Solve all problems and print their optima; raise ValueError if there are none or too many."""
     grid = grid_of(arguments)
     objectives = OBJECTIVES if arguments.objective is None else (arguments.objective,)
     records = {

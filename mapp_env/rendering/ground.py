@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from mapp_env.grid import Grid
 
-
 OUTLINED_SIDE = 64  # grids up to this side have their cells outlined
 LEAST_FLAG, LEAST_HOUSE, MOST_SIGN = 13.0, 15.0, 44.0  # points
 LEAST_TINT = 8.0  # points, of a cell that is tinted

@@ -20,11 +20,9 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-
 OVERSAMPLING = 4
 
-Icon = NDArray[np.uint8]
-"""Shape (height, width, 4): red, green, blue, alpha; read-only, as it is shared."""
+Icon = NDArray[np.uint8]  # (height, width, 4): red, green, blue, alpha; read-only, as it is shared
 
 
 @lru_cache(maxsize=256)

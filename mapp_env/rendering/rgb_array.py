@@ -19,7 +19,6 @@ from mapp_env.rendering.palette import Colour, agent_colour, blend
 if TYPE_CHECKING:
     from mapp_env.grid import Grid
 
-
 MAX_SIDE = 1024  # default pixels of the longer side of the grid, margins and bar not counted
 MAX_CELL = 72
 MIN_AREA = (240, 72)  # least width and height above the bar: a tiny grid has its bar, too

@@ -13,9 +13,7 @@ from mapp_env.solvers.held_karp import Steps, route_tables
 from mapp_env.solvers.solution import UNBOUNDED, team_of
 from mapp_env.validation import check_choice
 
-SUBSET = 12
-"""Landmarks that :func:`subset_bound` looks at: about a millisecond."""
-
+SUBSET = 12  # landmarks that subset_bound() looks at: about a millisecond
 ROUNDS = 200
 SCALE = 1 << 10
 """Penalties are whole multiples of 1 / SCALE of a step, so that a bound has no rounding error."""
@@ -93,19 +91,18 @@ def ascend(distances: Steps, closed: bool, n_agents: int, nodes: NDArray[np.int6
     """
     penalties, degrees = nodes[0], nodes[3]
     n_nodes = distances.shape[0]
+    at_depot = 2 if closed else n_agents
     best = 0
     stride = 0
     for turn in range(ROUNDS):
         weight = span(distances, closed, nodes)
-        for node in range(n_nodes):
-            limit = 2 if closed or node > 0 else n_agents
-            weight -= limit * penalties[node]
+        weight -= 2 * penalties[1:].sum() + at_depot * penalties[0]
         best = max(best, weight)
         if turn == 0:
             stride = max(weight // (2 * n_nodes), 1)
         step = max(stride * (ROUNDS - turn) // ROUNDS, 1)
         for node in range(n_nodes):
-            limit = 2 if closed or node > 0 else n_agents
+            limit = 2 if node > 0 else at_depot
             penalties[node] += step * (degrees[node] - limit)
             # "At most" may only be punished where it is broken.
             if not closed and penalties[node] < 0:
@@ -128,13 +125,8 @@ def span(distances: Steps, closed: bool, nodes: NDArray[np.int64]) -> int:
     reach[root] = 0
     links[root] = root
     for _ in range(root, n_nodes):
-        nearest = -1
-        least = UNBOUNDED
-        for node in range(root, n_nodes):
-            if reach[node] < least:
-                nearest = node
-                least = reach[node]
-        total += least
+        nearest = root + reach[root:].argmin()
+        total += reach[nearest]
         # Joined nodes are beyond UNBOUNDED.
         reach[nearest] = 2 * UNBOUNDED
         if nearest != root:
@@ -146,24 +138,12 @@ def span(distances: Steps, closed: bool, nodes: NDArray[np.int64]) -> int:
                 reach[node] = weight
                 links[node] = nearest
     if closed:
-        first = UNBOUNDED
-        second = UNBOUNDED
-        for node in range(1, n_nodes):
-            weight = SCALE * distances[0, node] + penalties[0] + penalties[node]
-            if weight < first:
-                second = first
-                first = weight
-                links[0] = node
-            elif weight < second:
-                second = weight
-        total += first + second
         degrees[0] = 2
         for node in range(1, n_nodes):
-            weight = SCALE * distances[0, node] + penalties[0] + penalties[node]
-            # The two best edges, the second being the first of its weight.
-            if node == links[0]:
-                degrees[node] += 1
-            elif weight == second:
-                degrees[node] += 1
-                second = -UNBOUNDED
+            reach[node] = SCALE * distances[0, node] + penalties[0] + penalties[node]
+        for _ in range(2):
+            nearest = 1 + reach[1:].argmin()
+            total += reach[nearest]
+            degrees[nearest] += 1
+            reach[nearest] = UNBOUNDED
     return total

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from mapp_env.solvers.solution import UNBOUNDED
 
-NOBODY = -1
-
 
 def assign_landmarks(
     distances: NDArray[np.integer[Any]],
@@ -34,7 +32,7 @@ def assign_landmarks(
     """
     at, left = agents.astype(np.int64), left.copy()
     steps = np.zeros(at.shape, np.int64)
-    who = np.full(left.shape, NOBODY, np.int64)
+    who = np.full(left.shape, -1, np.int64)
     when = np.zeros(left.shape, np.int64)
     while left.any():
         rows = np.flatnonzero(left.any(axis=1))

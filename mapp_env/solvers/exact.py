@@ -27,9 +27,7 @@ from mapp_env.problem import Problem
 from mapp_env.solvers.held_karp import Steps, route_tables, tours_within, trace_route
 from mapp_env.solvers.solution import Solution, landmark_distances, solution_of, team_of
 
-MAX_EXACT_LANDMARKS = 20
-"""Largest number of landmarks: the table of routes takes 80 MiB then."""
-
+MAX_EXACT_LANDMARKS = 20  # the table of routes takes 80 MiB then
 FEW_AGENTS = 5  # up to which a table an agent, of wanted sets only, is faster than one of all
 
 

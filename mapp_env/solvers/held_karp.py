@@ -113,10 +113,8 @@ def trace_route(
         steps = routes[members, end]
         members ^= 1 << end
         for before in range(n_landmarks):
-            if (
-                members >> before & 1
-                and routes[members, before] + distances[before + 1, end + 1] == steps
-            ):
+            # Those that are not in the set are far.
+            if routes[members, before] + distances[before + 1, end + 1] == steps:
                 end = before
                 break
     return count

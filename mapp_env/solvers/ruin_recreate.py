@@ -80,7 +80,6 @@ def improve(
 
     ``trial`` equals ``now`` between iterations.
     """
-    n_routes = now.sizes.shape[0]
     for _ in range(iterations):
         if memory[BEST] <= bound and (
             layout.weight == 0 or memory[DONE] - memory[IMPROVED] >= PATIENCE
@@ -105,7 +104,7 @@ def improve(
             record(layout, now, best, memory)
         else:
             copy_touched(now, trial, scratch.touched)
-            for agent in range(n_routes):
+            for agent in range(now.sizes.shape[0]):
                 if scratch.touched[agent]:
                     for place in range(now.sizes[agent]):
                         scratch.holder[now.routes[agent, place]] = agent
@@ -180,10 +179,8 @@ def sort_removed(count: int, layout: Layout, scratch: Scratch, memory: NDArray[n
     for index in range(count):
         if mode < 4:
             keys[index] = draw(memory, 1 << 30)
-        elif mode < 6:
-            keys[index] = -layout.distances[0, removed[index]]
         else:
-            keys[index] = layout.distances[0, removed[index]]
+            keys[index] = layout.distances[0, removed[index]] * (-1 if mode < 6 else 1)
     for index in range(1, count):
         node = removed[index]
         key = keys[index]

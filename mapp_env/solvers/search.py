@@ -20,11 +20,8 @@ from mapp_env.solvers.ruin_recreate import BEST, DONE, Layout, Scratch, Team, im
 from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 from mapp_env.validation import check_count
 
-DEFAULT_ITERATIONS = 200_000
-"""Iterations without a time limit: well under a second for 50 landmarks, on any clock."""
-
+DEFAULT_ITERATIONS = 200_000  # without a time limit: well under a second for 50 landmarks
 MAX_ITERATIONS = 10**12
-
 CHUNK = 500  # iterations between two looks at the clock: some milliseconds
 
 # In units of the mean distance between landmarks over the square root of their number: roughly
@@ -115,10 +112,8 @@ class Search:
         ``bound`` is a cost that cannot be beaten: once it is reached, only the total distance is
         left to improve, and no more is to be done when that has not fallen for a while.
         """
-        going = improve(
-            iterations, bound, self._layout, *self._teams, self._scratch, self._memory, self._heat
-        )
-        return bool(going)
+        rest = (*self._teams, self._scratch, self._memory, self._heat)
+        return bool(improve(iterations, bound, self._layout, *rest))
 
     @property
     def cost(self) -> int:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from mapp_env.grid import Grid, fill_distances
 from mapp_env.problem import Problem
 
-UNBOUNDED = 1 << 60
-"""More than any cost, weighted or scaled, and twice it is still an int64."""
+UNBOUNDED = 1 << 60  # more than any cost, weighted or scaled; twice it is still an int64
 
 Routes = tuple[tuple[int, ...], ...]
 """For each agent the landmark cells that it visits, in order; an agent may have none."""
