@@ -36,17 +36,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(command_line: Sequence[str] | None = None) -> int:
-    """Carry out a command line.
+    """Carry out a command line, by default that of this process, and return its exit status.
 
-    Parameters
-    ----------
-    command_line : sequence of str, optional
-        What follows ``python -m mapp_env``; by default that of this process.
-
-    Returns
-    -------
-    int
-        0, or 2 with a line on the standard error stream that says what is wrong.
+    It is 0, 2 with a line on the standard error stream that says what is wrong, or 130 where the
+    user interrupts.
     """
     parser = _Parser(
         prog=PROGRAM if os.path.basename(sys.argv[0]) == PROGRAM else "python -m mapp_env",

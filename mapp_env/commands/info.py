@@ -45,10 +45,16 @@ def run(arguments: argparse.Namespace) -> None:
     """Print what runs here."""
     # Its own is that of what runs, which need not be what is installed.
     own = {"python": platform.python_version(), "mapp-env": __version__}
+    files = cache_files()
     record: dict[str, Any] = {
         "versions": {**own, **versions_of(PACKAGES)},
         "extras": versions_of(EXTRAS),
-        "compiled_code": _compiled_code(),
+        "compiled_code": {
+            "compiled": is_compiled(),
+            "cache": [str(folder) for folder in cache_folders()],
+            "files": len(files),
+            "bytes": sum(path.stat().st_size for path in files),
+        },
         "device": {
             "platform": platform.platform(),
             "processor": platform.machine(),
@@ -72,17 +78,6 @@ def versions_of(packages: Iterable[str]) -> dict[str, str | None]:
         except metadata.PackageNotFoundError:
             found[name] = None
     return found
-
-
-def _compiled_code() -> dict[str, Any]:
-    """Return where compiled kernels are kept, and how much there is of them."""
-    files, folders = cache_files(), cache_folders()
-    return {
-        "compiled": is_compiled(),
-        "cache": [str(folder) for folder in folders],
-        "files": len(files),
-        "bytes": sum(path.stat().st_size for path in files),
-    }
 
 
 def _accelerator() -> str | None:

@@ -17,10 +17,7 @@ DEFAULT_FPS = 4.0
 
 
 def check_file(option: str, out: str) -> str:
-    """Return what a path leads to, if a file could be written there.
-
-    Raises a ValueError if none could; the message names the option.
-    """
+    """Return what a path leads to; raise ValueError, for the option, if no file can be there."""
     try:
         return check_writable(out)
     except ValueError as error:
@@ -30,25 +27,13 @@ def check_file(option: str, out: str) -> str:
 def picture_writer(
     option: str, out: str, fps: float | None = None
 ) -> Callable[[Problem, Plan], int]:
-    """Return what draws a plan into a file, and says how many bytes that took.
+    """Return what draws a plan into the file ``out``, and says how many bytes that took.
 
-    What stands in the way is said here, before anybody searches for a plan.
+    What stands in the way is said here, before anybody searches for a plan. ``option`` is what
+    messages call the file; ``fps``, frames a second, is for animations.
 
-    Parameters
-    ----------
-    option : str
-        What messages call the file.
-    out : str
-        The file: .gif for an animation; .png, .svg or .pdf for a figure.
-    fps : float, optional
-        Frames a second of an animation.
-
-    Raises
-    ------
-    ValueError
-        If nothing can be drawn there.
-    ImportError
-        If it is a figure and matplotlib is not there.
+    Raises a ValueError if nothing can be drawn there; an ImportError if it is a figure and
+    matplotlib is not there.
     """
     suffix = os.path.splitext(out)[1].lower()
     if suffix not in PICTURES:
@@ -56,18 +41,16 @@ def picture_writer(
     if suffix in FIGURES and fps is not None:
         raise ValueError("--fps is for animations: it does not go with a figure")
     check_file(option, out)
-    if suffix in FIGURES:
-        from mapp_env.rendering import draw_plan, save_figure
-
-        def draw_figure(problem: Problem, plan: Plan) -> int:
-            figure: Any = draw_plan(problem, plan).figure  # as no axes were given, all of one
-            return save_figure(figure, out)
-
-        return draw_figure
-
-    def animate(problem: Problem, plan: Plan) -> int:
+    if suffix in ANIMATIONS:
         from mapp_env.rendering import save_animation
 
-        return save_animation(out, problem, plan.actions, DEFAULT_FPS if fps is None else fps)
+        rate = DEFAULT_FPS if fps is None else fps
+        return lambda problem, plan: save_animation(out, problem, plan.actions, rate)
 
-    return animate
+    from mapp_env.rendering import draw_plan, save_figure
+
+    def draw_figure(problem: Problem, plan: Plan) -> int:
+        figure: Any = draw_plan(problem, plan).figure  # as no axes were given, all of one
+        return save_figure(figure, out)
+
+    return draw_figure

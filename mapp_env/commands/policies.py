@@ -34,22 +34,13 @@ class Policy(Protocol):
 
 
 def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
-    """Return what a loader makes of a policy's name.
+    """Return what a loader, written ``MODULE:FUNCTION``, makes of a policy's name.
 
-    Parameters
-    ----------
-    name : str
-        Of the policy, as the loader knows it.
-    loader : str
-        ``MODULE:FUNCTION``. While another than the default one loads, it and what it imports may
-        also lie in the working directory, if nowhere else.
+    While another than the default one loads, it and what it imports may also lie in the working
+    directory, if nowhere else.
 
-    Raises
-    ------
-    ValueError
-        If the loader is not written so, fails on the name, or returns no policy.
-    ImportError
-        If there is no such loader.
+    Raises a ValueError if the loader is not written so, fails on the name or returns no policy; an
+    ImportError if there is no such loader.
     """
     module, _, function = loader.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), function)):
@@ -124,20 +115,14 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     observation, _ = env.reset(seed=0, options={"landmarks": problem.landmarks})
     actions, over = [], False
     while not over:
-        actions.append(_act(policy, observation, problem.n_agents))
+        with _refusing("--policy cannot play this problem"):
+            found = np.asarray(policy.act(observation[None]))
+        if found.shape != (1, problem.n_agents) or found.dtype.kind not in "iu":
+            raise ValueError(
+                f"--policy must act with integers of shape (1, {problem.n_agents}), got shape "
+                f"{found.shape}, dtype {found.dtype}"
+            )
+        actions.append(found[0].astype(np.int64))
         observation, _, terminated, truncated, _ = env.step(actions[-1])
         over = terminated or truncated
     return replay(replace(problem, max_cycles=max_cycles), np.array(actions))
-
-
-def _act(policy: Policy, observation: NDArray[np.float32], n_agents: int) -> NDArray[np.int64]:
-    """Return a policy's joint action, shape (N,)."""
-    with _refusing("--policy cannot play this problem"):
-        found = np.asarray(policy.act(observation[None]))
-    if found.shape != (1, n_agents) or found.dtype.kind not in "iu":
-        raise ValueError(
-            f"--policy must act with integers of shape (1, {n_agents}), got shape {found.shape}, "
-            f"dtype {found.dtype}"
-        )
-    actions: NDArray[np.int64] = found[0].astype(np.int64)
-    return actions

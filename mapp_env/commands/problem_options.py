@@ -13,64 +13,51 @@ from mapp_env.validation import check_count, describe
 
 MAX_DRAWN = 2**63 - 1  # of seeds
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
-OPTIONS = (
-    "problem",
-    "grid",
-    "depot",
-    "rows",
-    "cols",
-    "grid_seed",
-    "landmarks",
-    "n_landmarks",
-    "n_agents",
-)
+GRID_OPTIONS = ("grid", "depot", "rows", "cols", "grid_seed")
+OPTIONS = ("problem", *GRID_OPTIONS, "landmarks", "n_landmarks", "n_agents")
 
 
 def add_grid_options(group: argparse._ArgumentGroup) -> None:
     """Add the options that say which grid; those not given are ``None``."""
-    group.add_argument(
+    add = group.add_argument
+    add(
         "--grid",
         metavar="GRID",
         help=f"a bundled grid ({', '.join(grid_names())}), a generator "
         f"({', '.join(generator_names())}) or a map file (default {GRID})",
     )
-    group.add_argument(
+    add(
         "--depot",
         type=_cell,
         metavar="CELL",
         help="of a map file that has none, or in place of its own (default: the free cell nearest "
         "to the centre)",
     )
-    group.add_argument("--rows", type=int, metavar="R", help="rows of a generated grid")
-    group.add_argument("--cols", type=int, metavar="C", help="columns of a generated grid")
-    group.add_argument(
-        "--grid-seed", type=int, metavar="S", help="which of the generated grids (default 0)"
-    )
+    add("--rows", type=int, metavar="R", help="rows of a generated grid")
+    add("--cols", type=int, metavar="C", help="columns of a generated grid")
+    add("--grid-seed", type=int, metavar="S", help="which of the generated grids (default 0)")
 
 
 def add_problem_options(parser: argparse.ArgumentParser) -> None:
     """Add the options to a command's parser; those not given are ``None``."""
     group = parser.add_argument_group("the problem")
-    group.add_argument(
+    add = group.add_argument
+    add(
         "--problem",
         metavar="FILE",
         help="a problem file, as Problem.save writes it, in place of the options below",
     )
     add_grid_options(group)
-    group.add_argument(
+    add(
         "--landmarks",
         nargs="+",
         type=_cell,
         metavar="CELL",
         help="their cells, as numbers (row * columns + column) or ROW,COL (default: drawn)",
     )
-    group.add_argument(
-        "--n-landmarks", type=int, metavar="K", help=f"how many to draw (default {N_LANDMARKS})"
-    )
-    group.add_argument("--n-agents", type=int, metavar="N", help=f"default {N_AGENTS}")
-    group.add_argument(
-        "--seed", type=int, metavar="S", help="of all that is drawn, but for the grid (default 0)"
-    )
+    add("--n-landmarks", type=int, metavar="K", help=f"how many to draw (default {N_LANDMARKS})")
+    add("--n-agents", type=int, metavar="N", help=f"default {N_AGENTS}")
+    add("--seed", type=int, metavar="S", help="of all that is drawn, but for the grid (default 0)")
 
 
 def problem_of(arguments: argparse.Namespace) -> Problem:
@@ -99,10 +86,7 @@ def seed_of(arguments: argparse.Namespace) -> int:
 
 
 def refuse_problem_options(arguments: argparse.Namespace, reason: str, but: str = "") -> None:
-    """Refuse options that another source of the problem, named in `but`, leaves without effect.
-
-    Raises a ValueError if one of them was given.
-    """
+    """Raise ValueError if an option other than ``but`` was given: none goes with ``reason``."""
     for name in OPTIONS:
         if name != but and getattr(arguments, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} does not go with {reason}")

@@ -22,21 +22,9 @@ from dataclasses import replace
 
 from gymnasium.utils import seeding
 
+from mapp_env.commands import problem_options, reports
 from mapp_env.commands.pictures import DEFAULT_FPS, PICTURES, picture_writer
 from mapp_env.commands.policies import DEFAULT_LOADER, load_policy, play_policy
-from mapp_env.commands.problem_options import (
-    add_problem_options,
-    problem_of,
-    refuse_problem_options,
-    seed_of,
-)
-from mapp_env.commands.reports import (
-    add_json_option,
-    costs_line,
-    costs_record,
-    landmarks_line,
-    print_report,
-)
 from mapp_env.plans.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers import solve
@@ -48,60 +36,53 @@ MAX_STEPS = 1_999  # an animation may have one frame more
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "--out",
         required=True,
         metavar="FILE",
         help=f"where to draw: {', '.join(PICTURES)}; all but an animation need matplotlib",
     )
-    parser.add_argument(
+    add(
         "--plan",
         metavar="PLAN",
         help="what is played: optimum (proven up to 20 landmarks, else the best found), random, "
         "or a plan file, which brings its problem along (default optimum)",
     )
-    parser.add_argument(
-        "--policy", metavar="NAME", help="in place of a plan: a trained policy that plays"
-    )
-    parser.add_argument(
+    add("--policy", metavar="NAME", help="in place of a plan: a trained policy that plays")
+    add(
         "--policy-loader",
         metavar="MODULE:FUNCTION",
         help="what turns the name into something with act(observations (B, N + 2K)) -> actions "
         f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
     )
-    parser.add_argument(
-        "--objective", choices=OBJECTIVES, help="what the optimum minimises (default cover_time)"
-    )
-    parser.add_argument(
+    add("--objective", choices=OBJECTIVES, help="what the optimum minimises (default cover_time)")
+    add(
         "--max-cycles",
         type=int,
         metavar="T",
         help=f"steps of random or of a policy at most (default {STEPS})",
     )
-    parser.add_argument(
+    add(
         "--fps", type=float, metavar="F", help=f"frames a second of a GIF (default {DEFAULT_FPS:g})"
     )
-    add_json_option(parser)
-    add_problem_options(parser)
+    reports.add_json_option(parser)
+    problem_options.add_problem_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Draw, and print what was written and what the plan costs.
 
-    Raises
-    ------
-    ValueError
-        If an option cannot be used, or the file cannot be written.
-    ImportError
-        If a library that was asked for is not there.
+    Raises a ValueError if an option cannot be used or a file cannot be written; an ImportError if a
+    library that was asked for is not there.
     """
     draw = picture_writer("--out", arguments.out, arguments.fps)
     problem, plan = _plan_of(arguments)
     size = draw(problem, plan)
     record = {"out": arguments.out, "bytes": size, "landmarks": list(problem.landmarks)}
     wrote = f"wrote {arguments.out}: {size} bytes"
-    lines = [wrote, costs_line(problem, plan), landmarks_line(problem)]
-    print_report(arguments, {**record, **costs_record(plan)}, lines)
+    lines = [wrote, reports.costs_line(problem, plan), reports.landmarks_line(problem)]
+    reports.print_report(arguments, {**record, **reports.costs_record(plan)}, lines)
 
 
 def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
@@ -117,8 +98,8 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
         raise ValueError("--policy-loader is for --policy")
     if source not in ("optimum", "random", "policy"):
         return _read_plan(arguments, source)
-    problem = problem_of(arguments)
-    seed = seed_of(arguments)
+    problem = problem_options.problem_of(arguments)
+    seed = problem_options.seed_of(arguments)
     if source == "optimum":
         return problem, solve(problem, arguments.objective or "cover_time", seed=seed)
     limit = STEPS if arguments.max_cycles is None else arguments.max_cycles
@@ -132,7 +113,7 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
 
 
 def _read_plan(arguments: argparse.Namespace, file: str) -> tuple[Problem, Plan]:
-    refuse_problem_options(arguments, "a plan file, which brings its problem along")
+    problem_options.refuse_problem_options(arguments, "a plan file, which brings its problem along")
     if arguments.seed is not None:
         raise ValueError("--seed does not go with a plan file")
     try:

@@ -25,26 +25,23 @@ from mapp_env.solvers import METHODS, solve
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    parser.add_argument(
+    add = parser.add_argument
+    add(
         "--objective",
         choices=OBJECTIVES,
         default=OBJECTIVES[0],
         help=f"what is minimised (default {OBJECTIVES[0]})",
     )
-    parser.add_argument(
+    add(
         "--method",
         choices=METHODS,
         default=METHODS[0],
         help="exact proves the optimum of up to 20 landmarks, search takes any number, pyvrp needs "
         f"the package of that name (default {METHODS[0]}: exact, else search)",
     )
-    parser.add_argument(
-        "--time-limit", type=float, metavar="SECONDS", help="that a search may take"
-    )
-    parser.add_argument("--out", metavar="FILE", help="where to write the plan: a JSON file")
-    parser.add_argument(
-        "--picture", metavar="FILE", help=f"where to draw it: {', '.join(PICTURES)}"
-    )
+    add("--time-limit", type=float, metavar="SECONDS", help="that a search may take")
+    add("--out", metavar="FILE", help="where to write the plan: a JSON file")
+    add("--picture", metavar="FILE", help=f"where to draw it: {', '.join(PICTURES)}")
     add_json_option(parser)
     add_problem_options(parser)
 
@@ -52,12 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Solve, and print, write and draw what was asked for.
 
-    Raises
-    ------
-    ValueError
-        If an option cannot be used, or a file cannot be written.
-    ImportError
-        If a library that was asked for is not there.
+    Raises a ValueError if an option cannot be used or a file cannot be written; an ImportError if a
+    library that was asked for is not there.
     """
     out = None if arguments.out is None else check_file("--out", arguments.out)
     draw = None

@@ -34,23 +34,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json_option(parser)
     group = parser.add_argument_group("the universe")
     add_grid_options(group)
-    group.add_argument(
+    add = group.add_argument
+    add(
         "--n-landmarks",
         type=int,
         default=N_LANDMARKS,
         metavar="K",
         help=f"of each problem (default {N_LANDMARKS})",
     )
-    group.add_argument(
-        "--n-agents", type=int, default=N_AGENTS, metavar="N", help=f"default {N_AGENTS}"
-    )
+    add("--n-agents", type=int, default=N_AGENTS, metavar="N", help=f"default {N_AGENTS}")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Solve all problems, and print what their optima are.
-
-    Raises a ValueError if there is no such universe, or it is too large.
-    """
+    """Solve all problems and print their optima; raise ValueError if there are none or too many."""
     grid = grid_of(arguments)
     objectives = OBJECTIVES if arguments.objective is None else (arguments.objective,)
     records = {

@@ -74,12 +74,7 @@ def find_grid(grid: object) -> Grid:
     """Return the grid meant by a grid, a bundled name or a path to a map file.
 
     A dict of a grid's text is one, too: what is left of a grid in the JSON of an environment's
-    spec.
-
-    Raises
-    ------
-    ValueError
-        If ``grid`` is none of them, or the file cannot be used.
+    spec. Raises a ValueError if ``grid`` is none of them, or the file cannot be used.
     """
     if isinstance(grid, Grid):
         return grid

@@ -50,8 +50,7 @@ def random_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, density: float
         walls = np.zeros((rows, cols), np.bool_)
         order = np.argsort(rng.random(rows * cols), kind="stable")
         walls.flat[order[: round(density * rows * cols)]] = True
-        found = _main_part(walls)
-        if found is not None:
+        if (found := _main_part(walls)) is not None:
             return found
     raise ValueError(
         f"density {density} leaves no connected {rows} x {cols} grid with seed {seed}: "

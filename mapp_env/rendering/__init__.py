@@ -1,12 +1,7 @@
 """Pictures of episodes and plans; a drawing library is loaded by the first picture that needs it.
 
-``Scene`` is what a picture shows. ``ansi(scene)`` draws it as text, ``rgb_array(scene)`` as pixels
-(Pillow), ``Window`` shows pixels on the screen (pygame-ce). ``save_animation(path, problem,
-joint_actions)`` plays an episode into an animated GIF, ``animate_plans(path, problem, plans)``
-several plans side by side, and ``save_gif(path, frames)`` writes the frames of a running
-environment (Pillow). ``draw_plan(problem, plan)`` draws the routes of a plan,
-``compare_plans(problem, plans)`` several side by side, and ``save_figure(figure, path)`` keeps them
-(matplotlib).
+``ansi`` needs none; ``rgb_array`` and the GIFs of ``save_animation``, ``animate_plans`` and
+``save_gif`` need Pillow, ``Window`` pygame-ce, ``draw_plan`` and ``compare_plans`` matplotlib.
 """
 
 from __future__ import annotations

@@ -16,12 +16,7 @@ if TYPE_CHECKING:
 class Display:
     """The implementation of ``render()`` for every interface.
 
-    Parameters
-    ----------
-    mode : {"human", "rgb_array", "ansi"} or None
-        The render mode.
-    fps : int
-        Pictures a second in the window.
+    ``mode`` is "human", "rgb_array", "ansi" or None; ``fps`` are pictures a second in the window.
     """
 
     def __init__(self, mode: str | None, fps: int) -> None:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from mapp_env.plans.plan import Plan
     from mapp_env.problem import Problem
 
-
 FORMATS = (".png", ".svg", ".pdf")
 MAX_BYTES = 1 << 28
 

@@ -12,18 +12,8 @@ from matplotlib.colors import ListedColormap
 from matplotlib.patches import Ellipse, Polygon, Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
-from mapp_env.rendering.palette import (
-    DEPOT,
-    DEPOT_CELL,
-    FLAG,
-    FLAG_CELL,
-    FLOOR,
-    GRID_LINE,
-    INK,
-    PAPER,
-    WALL,
-    to_hex,
-)
+from mapp_env.rendering import palette
+from mapp_env.rendering.palette import to_hex
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,14 +21,13 @@ if TYPE_CHECKING:
 
     from mapp_env.grid import Grid
 
-
 OUTLINED_SIDE = 64  # grids up to this side have their cells outlined
 LEAST_FLAG, LEAST_HOUSE, MOST_SIGN = 13.0, 15.0, 44.0  # points
 LEAST_TINT = 8.0  # points, of a cell that is tinted
 HALO = 2.2  # points, of the light line around a sign
 NOT_VISITED: dict[str, Any] = {
-    "facecolor": to_hex(FLAG_CELL),
-    "edgecolor": to_hex(FLAG),
+    "facecolor": to_hex(palette.FLAG_CELL),
+    "edgecolor": to_hex(palette.FLAG),
     "hatch": "////",
     "linewidth": 1.4,
 }
@@ -56,7 +45,7 @@ def draw_ground(ax: Axes, grid: Grid) -> None:
     """Draw floor and walls, and the outlines of cells that are not too small for them."""
     ax.imshow(
         grid.walls,
-        cmap=ListedColormap([to_hex(FLOOR), to_hex(WALL)]),
+        cmap=ListedColormap([to_hex(palette.FLOOR), to_hex(palette.WALL)]),
         vmin=0,
         vmax=1,
         interpolation="nearest",
@@ -69,7 +58,7 @@ def draw_ground(ax: Axes, grid: Grid) -> None:
         lines = [
             ((col + 0.5, row - 0.5), (col + 0.5, row + 0.5)) for row, col in np.argwhere(upright)
         ] + [((col - 0.5, row + 0.5), (col + 0.5, row + 0.5)) for row, col in np.argwhere(level)]
-        outlines = LineCollection(lines, colors=to_hex(GRID_LINE), linewidths=0.6, zorder=1)
+        outlines = LineCollection(lines, colors=to_hex(palette.GRID_LINE), linewidths=0.6, zorder=1)
         ax.add_collection(outlines, autolim=False)
 
 
@@ -90,7 +79,7 @@ class Signs:
         """Tint cells that are large enough for it, under everything else."""
         if self.points < LEAST_TINT:
             return
-        colour = to_hex(DEPOT_CELL if of_depot else FLAG_CELL)
+        colour = to_hex(palette.DEPOT_CELL if of_depot else palette.FLAG_CELL)
         for cell in cells:
             across, down = middle_of(self.grid, cell)
             corner = (across - 0.5, down - 0.5)
@@ -107,8 +96,9 @@ class Signs:
         roof = at((0.06, 0.50), (0.50, 0.10), (0.94, 0.50), (0.80, 0.50))
         walls = at((0.80, 0.88), (0.20, 0.88), (0.20, 0.50))
         door = at((0.42, 0.60), (0.58, 0.60), (0.58, 0.88), (0.42, 0.88))
-        self._add(Polygon(roof + walls, facecolor=to_hex(DEPOT), linewidth=0, zorder=5), True)
-        self._add(Polygon(door, facecolor=to_hex(DEPOT_CELL), linewidth=0, zorder=5.1), False)
+        outline = Polygon(roof + walls, facecolor=to_hex(palette.DEPOT), linewidth=0, zorder=5)
+        self._add(outline, True)
+        self._add(Polygon(door, facecolor=to_hex(palette.DEPOT_CELL), linewidth=0, zorder=5.1))
 
     def flag(self, cell: int) -> None:
         """Draw a landmark."""
@@ -118,10 +108,10 @@ class Signs:
         cloth = [(left, top), (left + 0.55 * size, top + 0.21 * size), (left, top + 0.42 * size)]
         pole = (left - 0.03 * size, top - 0.04 * size)
         length = foot - top + 0.04 * size
-        ink: dict[str, Any] = {"facecolor": to_hex(INK), "linewidth": 0, "zorder": 5.3}
-        self._add(Polygon(cloth, facecolor=to_hex(FLAG), linewidth=0, zorder=5.2), True)
+        ink: dict[str, Any] = {"facecolor": to_hex(palette.INK), "linewidth": 0, "zorder": 5.3}
+        self._add(Polygon(cloth, facecolor=to_hex(palette.FLAG), linewidth=0, zorder=5.2), True)
         self._add(Rectangle(pole, 0.06 * size, length, **ink), True)
-        self._add(Ellipse((left, foot), 0.28 * size, 0.10 * size, **ink), False)
+        self._add(Ellipse((left, foot), 0.28 * size, 0.10 * size, **ink))
 
     def frame(self, cell: int) -> None:
         """Mark a landmark that is not visited, exactly on its cell."""
@@ -143,9 +133,9 @@ class Signs:
             _between(half, down, self.grid.rows - 1 - half),
         )
 
-    def _add(self, patch: Patch, with_halo: bool) -> None:
+    def _add(self, patch: Patch, with_halo: bool = False) -> None:
         if with_halo:
-            halo = Stroke(linewidth=HALO, foreground=to_hex(PAPER))
+            halo = Stroke(linewidth=HALO, foreground=to_hex(palette.PAPER))
             patch.set_path_effects([halo, Normal()])
         patch.set_clip_on(False)
         self.ax.add_patch(patch)

@@ -13,30 +13,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.rendering.palette import (
-    CHECK,
-    DEPOT,
-    DEPOT_CELL,
-    FLAG,
-    FLAG_CELL,
-    FLAG_VISITED,
-    FLAG_VISITED_CELL,
-    INK,
-    PAPER,
-    Colour,
-    blend,
-    ink_on,
-)
+from mapp_env.rendering import palette
+from mapp_env.rendering.palette import Colour, blend, ink_on
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-
 OVERSAMPLING = 4
 
-Icon = NDArray[np.uint8]
-"""Shape (height, width, 4): red, green, blue, alpha; read-only, as it is shared."""
+Icon = NDArray[np.uint8]  # (height, width, 4): red, green, blue, alpha; read-only, as it is shared
 
 
 @lru_cache(maxsize=256)
@@ -44,7 +30,7 @@ def disc(size: int, colour: Colour, label: str) -> Icon:
     """Return an agent: a disc with its number, without the number where it would not be legible."""
 
     def draw(pen: ImageDraw, s: float) -> None:
-        pen.ellipse((0, 0, s - 1, s - 1), fill=PAPER)
+        pen.ellipse((0, 0, s - 1, s - 1), fill=palette.PAPER)
         rim = max(0.05 * s, OVERSAMPLING)
         pen.ellipse((rim, rim, s - 1 - rim, s - 1 - rim), fill=colour)
         if size >= 13:
@@ -61,9 +47,9 @@ def flag(size: int, visited: bool, plate: bool = False) -> Icon:
 
     ``plate`` puts it on a round ground, for grids whose cells are too small to be tinted.
     """
-    cloth = FLAG_VISITED if visited else FLAG
-    ground = FLAG_VISITED_CELL if visited else FLAG_CELL
-    pole = blend(INK, FLAG_VISITED_CELL, 0.45) if visited else INK
+    cloth = palette.FLAG_VISITED if visited else palette.FLAG
+    ground = palette.FLAG_VISITED_CELL if visited else palette.FLAG_CELL
+    pole = blend(palette.INK, palette.FLAG_VISITED_CELL, 0.45) if visited else palette.INK
 
     def draw(pen: ImageDraw, s: float) -> None:
         inset = 0.0
@@ -82,7 +68,7 @@ def flag(size: int, visited: bool, plate: bool = False) -> Icon:
         if visited:
             thick = max(0.10 * s, 1.5 * OVERSAMPLING)
             check = [at(0.48, 0.70), at(0.60, 0.82), at(0.84, 0.52)]
-            pen.line(check, fill=CHECK, width=round(thick), joint="curve")
+            pen.line(check, fill=palette.CHECK, width=round(thick), joint="curve")
 
     return _icon(size, size, draw)
 
@@ -93,10 +79,11 @@ def house(size: int, plate: bool = False) -> Icon:
 
     def draw(pen: ImageDraw, s: float) -> None:
         if plate:
-            _draw_plate(pen, s, DEPOT, DEPOT_CELL)
-        pen.rectangle((0.22 * s, 0.46 * s, 0.78 * s, 0.86 * s), fill=DEPOT)
-        pen.polygon([(0.08 * s, 0.5 * s), (0.5 * s, 0.12 * s), (0.92 * s, 0.5 * s)], fill=DEPOT)
-        pen.rectangle((0.42 * s, 0.60 * s, 0.58 * s, 0.86 * s), fill=DEPOT_CELL)
+            _draw_plate(pen, s, palette.DEPOT, palette.DEPOT_CELL)
+        pen.rectangle((0.22 * s, 0.46 * s, 0.78 * s, 0.86 * s), fill=palette.DEPOT)
+        roof = [(0.08 * s, 0.5 * s), (0.5 * s, 0.12 * s), (0.92 * s, 0.5 * s)]
+        pen.polygon(roof, fill=palette.DEPOT)
+        pen.rectangle((0.42 * s, 0.60 * s, 0.58 * s, 0.86 * s), fill=palette.DEPOT_CELL)
 
     return _icon(size, size, draw)
 

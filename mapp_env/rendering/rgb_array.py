@@ -13,25 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.engine.scene import TRAIL_MOVES, Scene
-from mapp_env.rendering import icons
-from mapp_env.rendering.palette import (
-    CHECK,
-    DEPOT_CELL,
-    FLAG_CELL,
-    FLAG_VISITED_CELL,
-    FLOOR,
-    GRID_LINE,
-    INK,
-    PAPER,
-    WALL,
-    Colour,
-    agent_colour,
-    blend,
-)
+from mapp_env.rendering import icons, palette
+from mapp_env.rendering.palette import Colour, agent_colour, blend
 
 if TYPE_CHECKING:
     from mapp_env.grid import Grid
-
 
 MAX_SIDE = 1024  # default pixels of the longer side of the grid, margins and bar not counted
 MAX_CELL = 72
@@ -127,8 +113,8 @@ class _Layout:
 def _layout(grid: Grid, n_landmarks: int, max_cycles: int, max_side: int) -> _Layout:
     cell = max(min(MAX_CELL, max_side // max(grid.rows, grid.cols)), 1)
     # The widest texts that the bar will ever show in this episode.
-    left, right = _status_texts(max_cycles, max_cycles, n_landmarks, n_landmarks)
-    bar_width = sum(icons.text(part, TEXT, PAPER).shape[1] for part in (left, right)) + 2 * BAR
+    texts = _status_texts(max_cycles, max_cycles, n_landmarks, n_landmarks)
+    bar_width = sum(icons.text(part, TEXT, palette.PAPER).shape[1] for part in texts) + 2 * BAR
     width = max(grid.cols * cell + 2 * MARGIN, bar_width, MIN_AREA[0])
     height = max(grid.rows * cell + 2 * MARGIN, MIN_AREA[1])
     width, height = width + width % 2, height + height % 2
@@ -140,19 +126,19 @@ def _layout(grid: Grid, n_landmarks: int, max_cycles: int, max_side: int) -> _La
 def _background(grid: Grid, layout: _Layout) -> Frame:
     """Return what stays the same during an episode; not to be written into."""
     frame = np.empty((layout.height + BAR, layout.width, 3), dtype=np.uint8)
-    frame[:] = WALL  # beyond the border agents bump just as into walls
-    frame[layout.height :] = INK
+    frame[:] = palette.WALL  # beyond the border agents bump just as into walls
+    frame[layout.height :] = palette.INK
     cell, (rows, cols) = layout.cell, grid.walls.shape
-    colours = np.where(grid.walls[:, :, None], WALL, FLOOR).astype(np.uint8)
+    colours = np.where(grid.walls[:, :, None], palette.WALL, palette.FLOOR).astype(np.uint8)
     area = frame[layout.top :, layout.left :][: rows * cell, : cols * cell]
     area[:] = colours.repeat(cell, axis=0).repeat(cell, axis=1)
     if layout.detailed:
         free = ~grid.walls
         for row, col in np.argwhere(free[:, 1:] & free[:, :-1]):
-            area[row * cell : (row + 1) * cell, (col + 1) * cell] = GRID_LINE
+            area[row * cell : (row + 1) * cell, (col + 1) * cell] = palette.GRID_LINE
         for row, col in np.argwhere(free[1:] & free[:-1]):
-            area[(row + 1) * cell, col * cell : (col + 1) * cell] = GRID_LINE
-        _tint(frame, layout, grid.depot, DEPOT_CELL)
+            area[(row + 1) * cell, col * cell : (col + 1) * cell] = palette.GRID_LINE
+        _tint(frame, layout, grid.depot, palette.DEPOT_CELL)
     frame.flags.writeable = False
     return frame
 
@@ -161,7 +147,7 @@ def _draw_flag_cells(frame: Frame, layout: _Layout, scene: Scene) -> None:
     """Tint the landmarks' cells, which shows even under a crowd of agents."""
     if layout.detailed:
         for cell, visited in zip(scene.landmarks, scene.visited, strict=True):
-            _tint(frame, layout, cell, FLAG_VISITED_CELL if visited else FLAG_CELL)
+            _tint(frame, layout, cell, palette.FLAG_VISITED_CELL if visited else palette.FLAG_CELL)
 
 
 def _draw_depot_and_flags(frame: Frame, layout: _Layout, scene: Scene) -> None:
@@ -190,7 +176,7 @@ def _draw_trails(frame: Frame, layout: _Layout, scene: Scene) -> None:
                 continue
             top, bottom = sorted((int(start[0]) + lane, int(end[0]) + lane))
             left, right = sorted((int(start[1]) + lane, int(end[1]) + lane))
-            faded = blend(FLOOR, colour, 0.45 + 0.55 * (age + 1) / len(recent))
+            faded = blend(palette.FLOOR, colour, 0.45 + 0.55 * (age + 1) / len(recent))
             frame[max(top, 0) : bottom + thick, max(left, 0) : right + thick] = faded
 
 
@@ -268,16 +254,16 @@ def _draw_status(frame: Frame, layout: _Layout, scene: Scene) -> None:
     n_visited, n_landmarks = sum(scene.visited), len(scene.landmarks)
     left, right = _status_texts(scene.step, scene.max_cycles, n_visited, n_landmarks)
     middle = layout.height + (BAR + 3) / 2
-    icon = icons.text(left, TEXT, PAPER)
+    icon = icons.text(left, TEXT, palette.PAPER)
     paste(frame, icon, middle, BAR / 2 + icon.shape[1] / 2)
-    complete = n_visited == n_landmarks
-    icon = icons.text(right, TEXT, blend(CHECK, PAPER, 0.55) if complete else PAPER)
+    done = blend(palette.CHECK, palette.PAPER, 0.55)
+    icon = icons.text(right, TEXT, done if n_visited == n_landmarks else palette.PAPER)
     paste(frame, icon, middle, layout.width - BAR / 2 - icon.shape[1] / 2)
     # A thin line above the texts that fills up with the steps.
     share = min(scene.step / max(scene.max_cycles, 1), 1.0)
     line = frame[layout.height : layout.height + 3]
-    line[:] = blend(INK, PAPER, 0.25)
-    line[:, : round(share * layout.width)] = blend(INK, PAPER, 0.75)
+    line[:] = blend(palette.INK, palette.PAPER, 0.25)
+    line[:, : round(share * layout.width)] = blend(palette.INK, palette.PAPER, 0.75)
 
 
 def _tint(frame: Frame, layout: _Layout, cell: int, colour: Colour) -> None:

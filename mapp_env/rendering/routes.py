@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from mapp_env.grid import Grid
     from mapp_env.plans.plan import Plan
 
-
 ARROWS_APART = 20.0  # points, at least
 LEAST_WIDTH, MOST_WIDTH = 0.9, 2.4  # points, of a line
 LANES = 0.42  # cells, from the middle of a corridor to where the outermost lane ends
@@ -28,8 +27,6 @@ LANE = 0.13  # cells, of a lane where there is room for more
 LEAST_LANE = 2.4  # points, of a lane if there is room for it
 HOME_PALER = 0.3
 DASHES = (0, (2.4, 1.8))
-
-Move: TypeAlias = tuple[int, int]
 
 
 def draw_routes(ax: Axes, grid: Grid, plan: Plan, points: float) -> None:
@@ -64,7 +61,7 @@ def _lanes(tours: tuple[tuple[int, ...], ...]) -> list[int]:
     nobody stay near the middle of their corridors.
     """
     lanes: list[int] = []
-    moves_on: list[set[Move]] = []
+    moves_on: list[set[tuple[int, int]]] = []
     for tour in tours:
         moves = set(pairwise(tour))
         lane = next(
@@ -144,8 +141,7 @@ def _draw_arrows(ax: Axes, route: _Route, width: float, points: float) -> None:
         )
     for (sign, colour), places in heads.items():
         ax.plot(
-            [across for across, _ in places],
-            [down for _, down in places],
+            *zip(*places, strict=True),
             marker=sign,
             markersize=size,
             color=colour,

@@ -108,10 +108,7 @@ def _together(panels: list[Iterator[Frame]]) -> Iterator[Frame]:
     shown = [next(panel) for panel in panels]
     gap = np.full((shown[0].shape[0], BETWEEN, 3), PAPER, np.uint8)
     while True:
-        row: list[Frame] = []
-        for frame in shown:
-            row += [gap, frame] if row else [frame]
-        yield np.hstack(row)
+        yield np.hstack([part for frame in shown for part in (gap, frame)][1:])
         later = [next(panel, None) for panel in panels]
         if all(frame is None for frame in later):
             return
@@ -131,10 +128,7 @@ class Gap(NamedTuple):
 def gaps(plans: Mapping[str, Plan]) -> dict[str, dict[str, Gap]]:
     """Return for each plan how far it is from those that are proven optimal, by objective.
 
-    Raises
-    ------
-    ValueError
-        If a plan costs less than what is said to be the optimum.
+    Raises a ValueError if a plan costs less than what is said to be the optimum.
     """
     optima = {plan.objective: plan.cost for plan in plans.values() if plan.status == "optimal"}
     found: dict[str, dict[str, Gap]] = {}
@@ -153,13 +147,7 @@ def gaps(plans: Mapping[str, Plan]) -> dict[str, dict[str, Gap]]:
 
 
 def check_plans(problem: object, plans: object) -> None:
-    """Refuse what is no mapping of labels to plans of the problem.
-
-    Raises
-    ------
-    ValueError
-        That names the argument, or the label of the plan.
-    """
+    """Refuse, with a ValueError, what is no mapping of labels to plans of the problem."""
     if not isinstance(problem, Problem):
         raise ValueError(f"problem must be a mapp_env.Problem, got {describe(problem)}")
     if not isinstance(plans, Mapping) or not 1 <= len(plans) <= MAX_PLANS:
@@ -173,9 +161,7 @@ def check_plans(problem: object, plans: object) -> None:
             raise ValueError(
                 f"plans[{describe(label)}] must be a mapp_env.Plan, got {describe(plan)}"
             )
-        own = plan.problem
-        same = own is None or (
-            own.grid == problem.grid and set(own.landmarks) == set(problem.landmarks)
-        )
+        own = plan.problem or problem
+        same = own.grid == problem.grid and set(own.landmarks) == set(problem.landmarks)
         if not same or len(plan.tours) != problem.n_agents:
             raise ValueError(f"plans[{describe(label)}] is a plan of another problem")

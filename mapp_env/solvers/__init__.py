@@ -18,8 +18,7 @@ __all__ = ["METHODS", "Solution", "optimal_costs", "save_vrplib", "solve", "solv
 
 METHODS = ("auto", "exact", "search", "pyvrp")
 
-QUICK_LANDMARKS = 16
-"""Up to so many landmarks the exact solver takes a fraction of a second; up to 20, two seconds."""
+QUICK_LANDMARKS = 16  # that the exact solver takes a fraction of a second for; for 20, two seconds
 
 
 def solve(

@@ -16,15 +16,9 @@ from mapp_env.solvers.held_karp import Steps, route_costs, shortest_routes
 from mapp_env.solvers.solution import cell_distances, team_of
 from mapp_env.validation import as_array, check_choice, check_count, describe
 
-MAX_BATCH_LANDMARKS = 12
-"""Largest number of landmarks of each problem."""
-
-MAX_UNIVERSE_PROBLEMS = 10_000_000
-"""Largest number of problems of a grid: up to half a gigabyte of answers."""
-
-MAX_UNIVERSE_WORK = 20_000_000_000
-"""Largest number of them times ``3 ** n_landmarks``: some minutes."""
-
+MAX_BATCH_LANDMARKS = 12  # of each problem
+MAX_UNIVERSE_PROBLEMS = 10_000_000  # of a grid: up to half a gigabyte of answers
+MAX_UNIVERSE_WORK = 20_000_000_000  # of them times 3 ** n_landmarks: some minutes
 CHUNK_WORK = 4_000_000  # between two chances to interrupt: some milliseconds
 
 
@@ -40,12 +34,8 @@ class Workspace(NamedTuple):
     def of(cls, n_landmarks: int) -> Workspace:
         """Allocate it."""
         size = 1 << n_landmarks
-        return cls(
-            np.empty((n_landmarks + 1, n_landmarks + 1), np.int32),
-            np.empty((size, n_landmarks), np.int32),
-            np.empty(size, np.int32),
-            np.empty((2, size // 2), np.int32),
-        )
+        shapes = ((n_landmarks + 1, n_landmarks + 1), (size, n_landmarks), (size,), (2, size // 2))
+        return cls(*(np.empty(shape, np.int32) for shape in shapes))
 
 
 def optimal_costs(
@@ -202,12 +192,7 @@ def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
 
 @kernel
 def solve_rows(
-    distances: Steps,
-    rows: NDArray[Any],
-    teams: int,
-    closed: bool,
-    optimum: Steps,
-    workspace: Workspace,
+    distances: Steps, rows: Steps, teams: int, closed: bool, optimum: Steps, workspace: Workspace
 ) -> None:
     """Fill in the ``optimum``, shape (p,), of each row of landmarks' nodes, shape (p, K).
 

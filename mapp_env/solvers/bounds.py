@@ -13,9 +13,7 @@ from mapp_env.solvers.held_karp import Steps, route_tables
 from mapp_env.solvers.solution import UNBOUNDED, team_of
 from mapp_env.validation import check_choice
 
-SUBSET = 12
-"""Landmarks that :func:`subset_bound` looks at: about a millisecond."""
-
+SUBSET = 12  # landmarks that subset_bound() looks at: about a millisecond
 ROUNDS = 200
 SCALE = 1 << 10
 """Penalties are whole multiples of 1 / SCALE of a step, so that a bound has no rounding error."""
@@ -24,9 +22,8 @@ SCALE = 1 << 10
 def lower_bound(problem: Problem, objective: str, distances: Steps) -> int:
     """Return a cost that no plan of a problem can beat; up to 12 landmarks it is the optimum.
 
-    ``distances`` are from :func:`~mapp_env.solvers.solution.landmark_distances`.
-
-    Raises a ValueError if the objective is unknown.
+    ``distances`` are :func:`~mapp_env.solvers.solution.landmark_distances`. Raises a ValueError if
+    the objective is unknown.
     """
     check_choice("objective", objective, OBJECTIVES)
     teams, closed = team_of(objective, problem.n_agents, len(distances) - 1)
@@ -87,34 +84,25 @@ def subset_bound(distances: Steps, teams: int, closed: bool, low: int) -> int:
 def ascend(distances: Steps, closed: bool, n_agents: int, nodes: NDArray[np.int64]) -> int:
     """Raise node penalties by subgradient steps; return the best bound found, times ``SCALE``.
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (n, n), n >= 3
-        Node 0 is the depot.
-    closed : bool
-        Bound one closed tour (1-trees: every degree is 2), or the open routes of a team (trees:
-        no degree above 2, the depot's not above ``n_agents``).
-    n_agents : int
-        Number of agents.
-    nodes : ndarray of int64, shape (4, n)
-        The penalties, zero on entry, and scratch space for :func:`span`.
+    ``distances`` are of at least 3 nodes, the depot first; ``closed`` bounds one closed tour
+    (1-trees: every degree is 2), else the open routes of a team (trees: no degree above 2, the
+    depot's not above ``n_agents``). ``nodes``, shape (4, n), holds the penalties, zero on entry,
+    and what :func:`span` works with.
     """
-    penalties = nodes[0]
-    degrees = nodes[3]
+    penalties, degrees = nodes[0], nodes[3]
     n_nodes = distances.shape[0]
+    at_depot = 2 if closed else n_agents
     best = 0
     stride = 0
     for turn in range(ROUNDS):
         weight = span(distances, closed, nodes)
-        for node in range(n_nodes):
-            limit = 2 if closed or node > 0 else n_agents
-            weight -= limit * penalties[node]
+        weight -= 2 * penalties[1:].sum() + at_depot * penalties[0]
         best = max(best, weight)
         if turn == 0:
             stride = max(weight // (2 * n_nodes), 1)
         step = max(stride * (ROUNDS - turn) // ROUNDS, 1)
         for node in range(n_nodes):
-            limit = 2 if closed or node > 0 else n_agents
+            limit = 2 if node > 0 else at_depot
             penalties[node] += step * (degrees[node] - limit)
             # "At most" may only be punished where it is broken.
             if not closed and penalties[node] < 0:
@@ -133,18 +121,12 @@ def span(distances: Steps, closed: bool, nodes: NDArray[np.int64]) -> int:
     root = 1 if closed else 0
     total = 0
     degrees[:] = 0
-    for node in range(root, n_nodes):
-        reach[node] = UNBOUNDED
+    reach[root:] = UNBOUNDED
     reach[root] = 0
     links[root] = root
     for _ in range(root, n_nodes):
-        nearest = -1
-        least = UNBOUNDED
-        for node in range(root, n_nodes):
-            if reach[node] < least:
-                nearest = node
-                least = reach[node]
-        total += least
+        nearest = root + reach[root:].argmin()
+        total += reach[nearest]
         # Joined nodes are beyond UNBOUNDED.
         reach[nearest] = 2 * UNBOUNDED
         if nearest != root:
@@ -156,24 +138,12 @@ def span(distances: Steps, closed: bool, nodes: NDArray[np.int64]) -> int:
                 reach[node] = weight
                 links[node] = nearest
     if closed:
-        first = UNBOUNDED
-        second = UNBOUNDED
-        for node in range(1, n_nodes):
-            weight = SCALE * distances[0, node] + penalties[0] + penalties[node]
-            if weight < first:
-                second = first
-                first = weight
-                links[0] = node
-            elif weight < second:
-                second = weight
-        total += first + second
         degrees[0] = 2
         for node in range(1, n_nodes):
-            weight = SCALE * distances[0, node] + penalties[0] + penalties[node]
-            # The two best edges, the second being the first of its weight.
-            if node == links[0]:
-                degrees[node] += 1
-            elif weight == second:
-                degrees[node] += 1
-                second = -UNBOUNDED
+            reach[node] = SCALE * distances[0, node] + penalties[0] + penalties[node]
+        for _ in range(2):
+            nearest = 1 + reach[1:].argmin()
+            total += reach[nearest]
+            degrees[nearest] += 1
+            reach[nearest] = UNBOUNDED
     return total

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from mapp_env.solvers.solution import UNBOUNDED
 
-NOBODY = -1
-
 
 def assign_landmarks(
     distances: NDArray[np.integer[Any]],
@@ -27,27 +25,14 @@ def assign_landmarks(
     Who walks to its next landmark and asks again at every step is told the same: a step brings the
     agent of each settled arrival one step nearer, and nobody else more than that.
 
-    Parameters
-    ----------
-    distances : ndarray of int, shape (S, S)
-        Shortest-path steps between nodes.
-    agents : ndarray of int, shape (B, N)
-        The nodes where the agents of B problems stand.
-    landmarks : ndarray of int, shape (B, K)
-        The landmarks' nodes.
-    left : ndarray of bool, shape (B, K)
-        Which of them are unvisited.
-
-    Returns
-    -------
-    who : ndarray of int64, shape (B, K)
-        The agent that goes to each landmark; -1 for those that are not left.
-    when : ndarray of int64, shape (B, K)
-        In how many steps it is there; 0 for those that are not left.
+    ``distances``, shape (S, S), are steps between nodes; ``agents``, shape (B, N), and
+    ``landmarks``, shape (B, K), the nodes of B problems; ``left``, shape (B, K), says which are
+    unvisited. Returned are the agent that goes to each landmark and in how many steps it is there,
+    both of shape (B, K), or -1 and 0 for those that are not left.
     """
     at, left = agents.astype(np.int64), left.copy()
     steps = np.zeros(at.shape, np.int64)
-    who = np.full(left.shape, NOBODY, np.int64)
+    who = np.full(left.shape, -1, np.int64)
     when = np.zeros(left.shape, np.int64)
     while left.any():
         rows = np.flatnonzero(left.any(axis=1))

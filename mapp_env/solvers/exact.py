@@ -27,30 +27,18 @@ from mapp_env.problem import Problem
 from mapp_env.solvers.held_karp import Steps, route_tables, tours_within, trace_route
 from mapp_env.solvers.solution import Solution, landmark_distances, solution_of, team_of
 
-MAX_EXACT_LANDMARKS = 20
-"""Largest number of landmarks: the table of routes takes 80 MiB then."""
-
+MAX_EXACT_LANDMARKS = 20  # the table of routes takes 80 MiB then
 FEW_AGENTS = 5  # up to which a table an agent, of wanted sets only, is faster than one of all
 
 
 def solve_exact(
     problem: Problem, objective: str, *, time_limit: float | None = None, seed: int = 0
 ) -> Solution:
-    """Return optimal routes, the same for any order of the landmarks.
+    """Return optimal routes for up to 20 landmarks, the same for any order of them.
 
-    Parameters
-    ----------
-    problem : Problem
-        At most 20 landmarks; any grid, any number of agents.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is minimised; see the top of this file for what is proven.
-    time_limit, seed
-        Not used: the work is bounded by the size, and nothing is random.
+    ``time_limit`` and ``seed`` are not used: the size bounds the work, and nothing is random.
 
-    Raises
-    ------
-    ValueError
-        If there are more landmarks; nothing has been allocated then.
+    Raises a ValueError if there are more landmarks; nothing has been allocated then.
     """
     n_landmarks = len(problem.landmarks)
     if n_landmarks > MAX_EXACT_LANDMARKS:
@@ -80,14 +68,7 @@ def solve_exact(
 def smallest_limit(costs: Steps, teams: int, low: int = 0) -> int:
     """Return the least limit, from ``low`` on, within which so many agents visit everything.
 
-    Parameters
-    ----------
-    costs : ndarray of int32, shape (2 ** K,)
-        What each set of landmarks costs one agent.
-    teams : int
-        Number of agents.
-    low : int
-        Where to start: what is known to be a lower bound.
+    ``costs``, shape (2 ** K,), is what each set costs one agent; ``low`` a known lower bound.
     """
     high = int(costs[-1])
     # An agent alone could walk the others' routes there and back, and its own last.
@@ -111,10 +92,7 @@ class Families:
     the subset lattice (inclusion-exclusion, as in Bjorklund, Husfeldt and Koivisto 2009,
     doi:10.1137/070683933). Counts stay below 4**20, so whole 64-bit numbers are exact.
 
-    Parameters
-    ----------
-    one : ndarray of bool, shape (2 ** K,)
-        The sets that one agent can visit; with a set, all its subsets.
+    ``one``, shape (2 ** K,), are the sets that one agent can visit; with a set, all its subsets.
     """
 
     def __init__(self, one: NDArray[np.bool_]) -> None:

@@ -18,10 +18,7 @@ Steps: TypeAlias = NDArray[np.int32]
 
 
 def route_tables(distances: Steps, closed: bool) -> tuple[Steps, Steps]:
-    """Return, for each set, the steps to each of its landmarks as the last, and its cost.
-
-    As :func:`shortest_routes` and :func:`route_costs` fill them in, (2 ** K, K) and (2 ** K,).
-    """
+    """Return the tables that :func:`shortest_routes` and :func:`route_costs` fill in."""
     n_landmarks = len(distances) - 1
     routes = np.empty((1 << n_landmarks, n_landmarks), np.int32)
     costs = np.empty(1 << n_landmarks, np.int32)
@@ -34,12 +31,8 @@ def route_tables(distances: Steps, closed: bool) -> tuple[Steps, Steps]:
 def shortest_routes(distances: Steps, routes: Steps) -> None:
     """Fill in the steps of the shortest way from the depot through each set of landmarks.
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Symmetric; node 0 is the depot.
-    routes : ndarray of int32, shape (2 ** K, K)
-        ``routes[S, k]``: through all of S, ending on k; at least ``FAR`` if k is not in S.
+    ``routes[S, k]``, shape (2 ** K, K), goes through all of S and ends on k; it is at least ``FAR``
+    if k is not in S. ``distances``, shape (K + 1, K + 1), are symmetric; node 0 is the depot.
     """
     n_landmarks = routes.shape[1]
     routes[0] = FAR
@@ -110,20 +103,18 @@ def trace_route(
     for last in range(n_landmarks):
         steps = routes[members, last]
         tour = steps + distances[0, last + 1]
-        if (tour if closed else steps) <= limit:
-            shorter = tour < least or (tour == least and steps < routes[members, end])
-            if shorter:
-                least = tour
-                end = last
+        if (tour if closed else steps) <= limit and (
+            tour < least or (tour == least and steps < routes[members, end])
+        ):
+            least = tour
+            end = last
     for place in range(count - 1, -1, -1):
         route[place] = end
         steps = routes[members, end]
         members ^= 1 << end
         for before in range(n_landmarks):
-            if (
-                members >> before & 1
-                and routes[members, before] + distances[before + 1, end + 1] == steps
-            ):
+            # Those that are not in the set are far.
+            if routes[members, before] + distances[before + 1, end + 1] == steps:
                 end = before
                 break
     return count

@@ -22,8 +22,7 @@ from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 
-DEFAULT_SECONDS = 2.0
-"""Time limit if none is given."""
+DEFAULT_SECONDS = 2.0  # if there is no time limit
 
 # PyVRP's own penalties for too long a route, up to 100,000 a step, leave a search that has to live
 # with a tight limit no way through plans that break it.
@@ -41,26 +40,10 @@ def solve_pyvrp(
 ) -> Solution:
     """Return short routes found by PyVRP, proven optimal where they meet a lower bound.
 
-    Parameters
-    ----------
-    problem, objective, on_better
-        As for :func:`~mapp_env.solvers.search.solve_search`.
-    time_limit : float, optional
-        Seconds; by default 2. PyVRP builds at least one plan, however few they are.
-    seed : int
-        Of the search, which is bounded by time, so the answer depends on the machine as well.
+    As :func:`~mapp_env.solvers.search.solve_search`, but it is bounded by time alone, 2 seconds by
+    default, so that the answer depends on the machine as well as on the ``seed``.
 
-    Returns
-    -------
-    Solution
-        The search ends early when the cost meets the bound.
-
-    Raises
-    ------
-    ImportError
-        If PyVRP is not installed.
-    ValueError
-        If ``objective`` is unknown.
+    Raises an ImportError if PyVRP is not installed, a ValueError if ``objective`` is unknown.
     """
     pyvrp = import_pyvrp()
     deadline = clock() + (DEFAULT_SECONDS if time_limit is None else time_limit)
@@ -90,7 +73,8 @@ def solve_pyvrp(
             duration_matrices=[np.zeros_like(arcs)],
         )
         # Where the longest route counts, any plan within the limit will do.
-        stop = _Stop(deadline, bound, on_better) if total else _Stop(deadline, UNBOUNDED - 1, None)
+        enough = (bound, on_better) if total else (UNBOUNDED - 1, None)
+        stop = _stop_at(deadline, *enough)
         with warnings.catch_warnings():
             # It says that no plan is in sight, and that is how this ends.
             warnings.simplefilter("ignore", pyvrp.exceptions.PenaltyBoundWarning)
@@ -113,24 +97,24 @@ def solve_pyvrp(
     return solution_of(problem, routes, best, bound)
 
 
-class _Stop:
-    """Tells PyVRP when to stop: at a time, or at a cost (which is far above any no plan).
+def _stop_at(
+    deadline: float, cost: int, on_better: Callable[[int], None] | None
+) -> Callable[[float], bool]:
+    """Return what tells PyVRP to stop: at a time, or at a cost (which is far above any no plan).
 
     PyVRP asks in each iteration, so this is also who sees costs fall.
     """
+    best = UNBOUNDED
 
-    def __init__(self, deadline: float, cost: int, on_better: Callable[[int], None] | None) -> None:
-        self._deadline = deadline
-        self._cost = cost
-        self._on_better = on_better
-        self._best = UNBOUNDED
+    def stop(best_cost: float) -> bool:
+        nonlocal best
+        if best_cost < best:
+            best = int(best_cost)
+            if on_better is not None:
+                on_better(best)
+        return best_cost <= cost or clock() >= deadline
 
-    def __call__(self, best_cost: float) -> bool:
-        if best_cost < self._best:
-            self._best = int(best_cost)
-            if self._on_better is not None:
-                self._on_better(self._best)
-        return best_cost <= self._cost or clock() >= self._deadline
+    return stop
 
 
 def import_pyvrp() -> Any:

@@ -59,7 +59,7 @@ class Scratch(NamedTuple):
     """What one iteration needs."""
 
     holder: NDArray[np.int64]  # (K + 1,), the agent that visits a node, -1 if none
-    removed: NDArray[np.int64]  # (K,)
+    removed: NDArray[np.int64]  # (K,), at first every landmark
     keys: NDArray[np.int64]  # (K,)
     touched: NDArray[np.bool_]  # (N,), whether a route differs from the one before
 
@@ -80,7 +80,6 @@ def improve(
 
     ``trial`` equals ``now`` between iterations.
     """
-    n_routes = now.sizes.shape[0]
     for _ in range(iterations):
         if memory[BEST] <= bound and (
             layout.weight == 0 or memory[DONE] - memory[IMPROVED] >= PATIENCE
@@ -92,11 +91,8 @@ def improve(
             heat[NOW] = heat[WARMEST]
             heat[FALL] = math.exp(math.log(heat[COLDEST] / heat[WARMEST]) / memory[CYCLE])
             memory[CYCLE] *= 2
-        if memory[DONE] == 0:
-            count = layout.near.shape[1]
-            for index in range(count):
-                scratch.removed[index] = index + 1
-        else:
+        count = layout.near.shape[1]
+        if memory[DONE] > 0:
             count = ruin(layout, trial, scratch, memory)
         sort_removed(count, layout, scratch, memory)
         recreate(count, layout, trial, scratch, memory)
@@ -108,7 +104,7 @@ def improve(
             record(layout, now, best, memory)
         else:
             copy_touched(now, trial, scratch.touched)
-            for agent in range(n_routes):
+            for agent in range(now.sizes.shape[0]):
                 if scratch.touched[agent]:
                     for place in range(now.sizes[agent]):
                         scratch.holder[now.routes[agent, place]] = agent
@@ -132,10 +128,7 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
     n_landmarks = layout.near.shape[1]
     wanted = min(1 + draw(memory, 2 * MEAN_REMOVED), n_landmarks)
     if layout.weight > 0 and draw(memory, 100) < LONGEST_PERCENT:
-        longest = 0
-        for agent in range(team.sizes.shape[0]):
-            if team.lengths[agent] > team.lengths[longest]:
-                longest = agent
+        longest = team.lengths.argmax()
         middle = int(team.routes[longest, draw(memory, team.sizes[longest])])
     else:
         middle = 1 + draw(memory, n_landmarks)
@@ -149,8 +142,7 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
             continue
         route = team.routes[agent]
         size = team.sizes[agent]
-        string = 1 + draw(memory, min(MAX_STRING, size))
-        string = min(string, wanted - count)
+        string = min(1 + draw(memory, min(MAX_STRING, size)), wanted - count)
         place = 0
         while route[place] != node:
             place += 1
@@ -187,10 +179,8 @@ def sort_removed(count: int, layout: Layout, scratch: Scratch, memory: NDArray[n
     for index in range(count):
         if mode < 4:
             keys[index] = draw(memory, 1 << 30)
-        elif mode < 6:
-            keys[index] = -layout.distances[0, removed[index]]
         else:
-            keys[index] = layout.distances[0, removed[index]]
+            keys[index] = layout.distances[0, removed[index]] * (-1 if mode < 6 else 1)
     for index in range(1, count):
         node = removed[index]
         key = keys[index]
@@ -210,9 +200,7 @@ def recreate(
     """Insert what was removed, each where it costs least, a few places being overlooked."""
     n_routes = team.sizes.shape[0]
     distances = layout.distances
-    top = 0
-    for agent in range(n_routes):
-        top = max(top, team.lengths[agent])
+    top = team.lengths[team.lengths.argmax()]
     blink = 1 + draw(memory, 2 * MEAN_BLINK)
     for index in range(count):
         node = scratch.removed[index]
@@ -261,26 +249,19 @@ def recreate(
 @kernel
 def cost_of(layout: Layout, team: Team) -> int:
     """Return what the search minimises."""
-    top = 0
-    total = 0
-    for agent in range(team.sizes.shape[0]):
-        top = max(top, team.lengths[agent])
-        total += team.lengths[agent]
-    return int(layout.weight * top + total)
+    longest = team.lengths[team.lengths.argmax()]
+    return int(layout.weight * longest + team.lengths.sum())
 
 
 @kernel
 def record(layout: Layout, team: Team, best: Team, memory: NDArray[np.int64]) -> None:
     """Keep a team that is better in the objective, or as good and shorter in all."""
-    top = 0
-    total = 0
+    total = team.lengths.sum()
     for agent in range(team.sizes.shape[0]):
-        size = team.sizes[agent]
-        top = max(top, team.lengths[agent])
-        if size > 0:
-            last = team.routes[agent, size - 1]
-            total += team.lengths[agent] - layout.back[last] + layout.distances[0, last]
-    primary = top if layout.weight > 0 else total
+        if team.sizes[agent] > 0:
+            last = team.routes[agent, team.sizes[agent] - 1]
+            total += layout.distances[0, last] - layout.back[last]
+    primary = team.lengths[team.lengths.argmax()] if layout.weight > 0 else total
     if primary < memory[BEST] or (primary == memory[BEST] and total < memory[BEST_TOTAL]):
         memory[BEST] = primary
         memory[BEST_TOTAL] = total

@@ -16,26 +16,12 @@ from numpy.typing import NDArray
 from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.ruin_recreate import (
-    BEST,
-    BEST_TOTAL,
-    COST,
-    CYCLE,
-    DONE,
-    WORD,
-    Layout,
-    Scratch,
-    Team,
-    improve,
-)
+from mapp_env.solvers.ruin_recreate import BEST, DONE, Layout, Scratch, Team, improve
 from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
 from mapp_env.validation import check_count
 
-DEFAULT_ITERATIONS = 200_000
-"""Iterations without a time limit: well under a second for 50 landmarks, on any clock."""
-
+DEFAULT_ITERATIONS = 200_000  # without a time limit: well under a second for 50 landmarks
 MAX_ITERATIONS = 10**12
-
 CHUNK = 500  # iterations between two looks at the clock: some milliseconds
 
 # In units of the mean distance between landmarks over the square root of their number: roughly
@@ -54,33 +40,14 @@ def solve_search(
     iterations: int | None = None,
     on_better: Callable[[int], None] | None = None,
 ) -> Solution:
-    """Return short routes, proven optimal where they meet a lower bound.
+    """Return short routes, proven optimal where they meet a lower bound, at which the search ends.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of any size.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is minimised; of routes with equal cover time or makespan the search keeps those of
-        smaller total distance.
-    time_limit : float, optional
-        Seconds. At least one plan is made, however few they are.
-    seed : int
-        The same seed and number of iterations give the same routes.
-    iterations : int, optional
-        Most iterations to carry out; without it 200,000, or as many as the time limit lets.
-    on_better : callable, optional
-        Called with each smaller cost.
+    Of routes with equal cover time or makespan it keeps those of smaller total distance. The same
+    ``seed`` and number of ``iterations`` give the same routes; without a number there are 200,000,
+    or as many as ``time_limit``, in seconds, lets. At least one plan is made, however few they are.
+    ``on_better`` is called with each smaller cost.
 
-    Returns
-    -------
-    Solution
-        The search ends early when the cost meets the bound.
-
-    Raises
-    ------
-    ValueError
-        If ``objective`` is unknown or ``iterations`` not a positive integer.
+    Raises a ValueError if ``objective`` is unknown or ``iterations`` not a positive integer.
     """
     if iterations is None:
         iterations = DEFAULT_ITERATIONS if time_limit is None else MAX_ITERATIONS
@@ -105,16 +72,8 @@ def solve_search(
 class Search:
     """A search that can be carried on.
 
-    Parameters
-    ----------
-    distances : ndarray of int32, shape (K + 1, K + 1)
-        Between the depot (node 0) and the landmarks; K is at least 1.
-    n_agents : int
-        Number of agents.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What is minimised.
-    seed : int
-        Not negative.
+    ``distances``, shape (K + 1, K + 1) int32 with K at least 1, are between the depot (node 0) and
+    the landmarks; ``seed`` is not negative.
     """
 
     def __init__(
@@ -122,33 +81,28 @@ class Search:
     ) -> None:
         distances = np.ascontiguousarray(distances, np.int32)
         n_landmarks = len(distances) - 1
+        total = objective == "total_distance"
         # No team walks less than one agent, by the triangle inequality.
-        n_routes = 1 if objective == "total_distance" else n_agents
-        home = distances[0].copy()
+        n_routes = 1 if total else n_agents
         self._layout = Layout(
             distances,
-            np.zeros_like(home) if objective == "cover_time" else home,
+            distances[0] * np.int32(objective != "cover_time"),
             (np.argsort(distances[:, 1:], axis=1, kind="stable") + 1).astype(np.int32),
-            0 if objective == "total_distance" else 2 * n_agents,
+            0 if total else 2 * n_agents,
         )
         self._teams = [
-            Team(
-                np.zeros((n_routes, n_landmarks), np.int32),
-                np.zeros(n_routes, np.int64),
-                np.zeros(n_routes, np.int64),
-            )
+            Team(np.zeros((n_routes, n_landmarks), np.int32), *np.zeros((2, n_routes), np.int64))
             for _ in range(3)
         ]
         self._scratch = Scratch(
             np.full(n_landmarks + 1, -1),
-            np.zeros(n_landmarks, np.int64),
+            np.arange(1, n_landmarks + 1),
             np.zeros(n_landmarks, np.int64),
             np.zeros(n_routes, np.bool_),
         )
-        self._memory = np.zeros(8, np.int64)
-        self._memory[WORD] = np.random.SeedSequence(seed).generate_state(1)[0]
-        self._memory[[COST, BEST, BEST_TOTAL]] = UNBOUNDED
-        self._memory[CYCLE] = FIRST_CYCLE
+        word = int(np.random.SeedSequence(seed).generate_state(1)[0])
+        # In the order of their places: WORD to CYCLE.
+        self._memory = np.array([word, *[UNBOUNDED] * 3, 0, 0, 0, FIRST_CYCLE], np.int64)
         leg = max(float(distances[1:, 1:].mean()) / math.sqrt(n_landmarks), 0.5)
         self._heat = np.array([COLD * leg, 1.0, HOT * leg, COLD * leg])
 
@@ -158,10 +112,8 @@ class Search:
         ``bound`` is a cost that cannot be beaten: once it is reached, only the total distance is
         left to improve, and no more is to be done when that has not fallen for a while.
         """
-        going = improve(
-            iterations, bound, self._layout, *self._teams, self._scratch, self._memory, self._heat
-        )
-        return bool(going)
+        rest = (*self._teams, self._scratch, self._memory, self._heat)
+        return bool(improve(iterations, bound, self._layout, *rest))
 
     @property
     def cost(self) -> int:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from mapp_env.grid import Grid, fill_distances
 from mapp_env.problem import Problem
 
-UNBOUNDED = 1 << 60
-"""More than any cost, weighted or scaled, and twice it is still an int64."""
+UNBOUNDED = 1 << 60  # more than any cost, weighted or scaled; twice it is still an int64
 
 Routes = tuple[tuple[int, ...], ...]
 """For each agent the landmark cells that it visits, in order; an agent may have none."""
@@ -41,17 +40,10 @@ class Solution:
 def solution_of(
     problem: Problem, routes: Iterable[Iterable[int]], cost: int, bound: int
 ) -> Solution:
-    """Return routes through nodes of a distance matrix as a solution.
+    """Return routes through nodes, ``k + 1`` for the problem's landmark ``k``, as a solution.
 
-    Parameters
-    ----------
-    problem : Problem
-        What was solved.
-    routes : iterable of iterable of int
-        Nodes in order: node ``k + 1`` is the problem's landmark ``k``. There may be fewer routes
-        than agents.
-    cost, bound : int
-        What the routes cost in the objective, and a proven lower bound of it.
+    There may be fewer routes than agents. ``cost`` is theirs in the objective, ``bound`` a proven
+    lower bound of it.
     """
     found = [tuple(problem.landmarks[node - 1] for node in route) for route in routes]
     idle = problem.n_agents - len(found)
@@ -78,26 +70,18 @@ def team_of(objective: str, n_agents: int, n_landmarks: int) -> tuple[int, bool]
 
 
 def landmark_distances(problem: Problem) -> NDArray[np.int32]:
-    """Return the shortest-path steps between the depot and the landmarks.
+    """Return the shortest-path steps between the depot and the landmarks, shape (K + 1, K + 1).
 
-    One breadth-first search a cell: never all pairs of a grid's cells.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its landmarks keep their order.
-
-    Returns
-    -------
-    ndarray of int32, shape (K + 1, K + 1)
-        Line and column 0 belong to the depot, ``k + 1`` to landmark ``k``. Symmetric.
+    Symmetric; line and column 0 belong to the depot, ``k + 1`` to landmark ``k``.
     """
-    cells = np.array([problem.grid.depot, *problem.landmarks], np.int64)
-    return cell_distances(problem.grid, cells)
+    return cell_distances(problem.grid, np.array([problem.grid.depot, *problem.landmarks]))
 
 
 def cell_distances(grid: Grid, cells: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
-    """Return the shortest-path steps between cells that can all be reached, shape (S, S) int32."""
+    """Return the shortest-path steps between cells that can all be reached, shape (S, S).
+
+    One breadth-first search a cell: never all pairs of a grid's cells.
+    """
     distances = np.empty((len(cells), len(cells)), np.int32)
     field = np.empty(grid.n_cells, np.int32)
     queue = np.empty(grid.n_cells, np.int32)
