@@ -23,8 +23,8 @@ from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 
+from baselines.learning.config import run_script
 from baselines.policies.acting import Acting
 from baselines.policies.evaluation import (
     EVALUATION_SEED,
@@ -190,7 +190,4 @@ def worst_cases(evaluation: Evaluation) -> list[str]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

@@ -20,18 +20,17 @@ fine-tuned, and it is said of how many the optimum was found.
 """
 
 import copy
-import sys
 import time
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
+from baselines.learning.config import run_script
 from baselines.learning.q_learning import joint_values
 from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
 from baselines.policies import play
@@ -109,17 +108,7 @@ class Episode(NamedTuple):
 
 
 class Tuner:
-    """A network, what it knows of the grid, and the problem it is trained on.
-
-    Parameters
-    ----------
-    args
-        Options.
-    network
-        Whose values tell good joint actions from bad ones; it is copied.
-    problem
-        The problem.
-    """
+    """A copy of a network, what it knows of the grid, and the problem it is trained on."""
 
     def __init__(self, args: Args, network: Network, problem: Problem) -> None:
         spec = network.spec
@@ -283,7 +272,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Args, description=__doc__)))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

@@ -20,10 +20,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.learning.config import REWARDS
+from baselines.learning.config import REWARDS, run_script
 from baselines.policies.evaluation import EVALUATION_SEED, find_optima, unseen_problems
 from baselines.policies.settings import N_ACTIONS, Setting
 from mapp_env.engine.loops import visit_rows
@@ -67,10 +66,7 @@ class RewardModel:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return what the rules make of moving to places (B, N), with the set of before, or (B,).
 
-        Returns
-        -------
-        left, rewards
-            (B,) the set of landmarks that are unvisited then (R5), and the rewards (R6).
+        These are the set of landmarks that are unvisited then (R5), and the reward (R6): (B,) each.
         """
         visited = (np.broadcast_to(unvisited, len(places))[:, None] & self.bits) == 0
         visited, rewards, _ = visit_rows(self.world, self.cells[places], self.landmarks, visited)
@@ -258,7 +254,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

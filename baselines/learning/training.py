@@ -89,16 +89,7 @@ class Progress:
 class Training(Trainable):
     """Episodes, the updates that are due after steps and episodes, and what is logged.
 
-    Parameters
-    ----------
-    args
-        Options.
-    grid
-        The grid.
-    problems
-        (P, K) landmark cells, a training problem per row.
-    learner
-        What is trained.
+    Trained is the learner, on each of the problems: (P, K) landmark cells.
     """
 
     UNIT, COLUMNS, SHOWN = "episodes", METRICS, ("steps", "reward")

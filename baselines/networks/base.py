@@ -107,12 +107,7 @@ class NetworkSpec:
 class Network(nn.Module):
     """A network from global observations to action values.
 
-    Parameters
-    ----------
-    spec
-        What is built.
-    generator
-        Source of the initial weights; on the device "meta", where there are none, None.
+    Its initial weights come from the generator; on the device "meta", where there are none, None.
     """
 
     spec_type: ClassVar[type[NetworkSpec]]

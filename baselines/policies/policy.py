@@ -30,12 +30,7 @@ PRETRAINED = Path(__file__).parents[1] / "pretrained"  # a folder for each name,
 class NetworkPolicy:
     """Greedy commands of a network: the joint action, or each agent's, of the highest value.
 
-    Parameters
-    ----------
-    network
-        Gives the values.
-    grid
-        The grid it was trained on; None if it plays on any.
+    ``grid`` is the one it was trained on; None if it plays on any.
     """
 
     def __init__(self, network: Network, grid: Grid | None = None) -> None:
@@ -63,22 +58,11 @@ def save_policy(
 ) -> None:
     """Write a network's weights, its spec and its grid to a safetensors file, in one piece.
 
-    Parameters
-    ----------
-    path
-        The file.
-    network
-        The network.
-    grid
-        What it is for; None for a network that plays on any.
-    half_precision
-        In 16 bits each, rounded: half the size, and nearly the same values. Tensors with values
-        that 16 bits have no room for keep theirs.
+    The grid of a network that plays on any is None. With `half_precision` weights are rounded to 16
+    bits: half the size, and nearly the same values; tensors with values that 16 bits have no room
+    for keep theirs.
 
-    Raises
-    ------
-    ValueError
-        If the network is for another number of cells than the grid has.
+    Raises a ValueError if the network is for another number of cells than the grid has.
     """
     # One metadata entry only: safetensors writes several in no fixed order.
     about = json.dumps(header(network.spec, grid), sort_keys=True)

@@ -21,21 +21,10 @@ class ReplayMemory:
     """The last `capacity` transitions, in arrays that are allocated once.
 
     Only ``terminated`` is kept of an episode's end: a time-out (truncation) says nothing about
-    the state it stopped in, so the learner goes on from there (it bootstraps).
+    the state it stopped in, so the learner goes on from there (it bootstraps). The rewards of
+    a batch are multiplied by `reward_scale`.
 
-    Parameters
-    ----------
-    capacity
-        Transitions that are kept.
-    observation_size, n_agents
-        Numbers in an observation, and in an action.
-    reward_scale
-        What the rewards of a batch are multiplied by.
-
-    Raises
-    ------
-    ValueError
-        If a size is invalid.
+    Raises a ValueError if a size is invalid.
     """
 
     def __init__(

@@ -67,15 +67,7 @@ class Resumable(Saved, Protocol):
 
 
 class Checkpoints:
-    """The checkpoints of one run.
-
-    Parameters
-    ----------
-    run
-        The run folder.
-    config
-        What the run is, ready for JSON; a checkpoint of anything else is refused.
-    """
+    """The checkpoints in a run's folder; any of a run with another config (JSON) is refused."""
 
     def __init__(self, run: Path, config: Mapping[str, Any]) -> None:
         self.folder = run / CHECKPOINTS
