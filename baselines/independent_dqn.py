@@ -214,13 +214,9 @@ class IndependentLearners:
     ) -> None:
         """Store for every agent what that agent saw, did and got; never what the others did."""
         for agent in range(self.spec.n_agents):
-            self.learners[agent % len(self.learners)].replay.add(
-                view(observation, agent, self.spec),
-                actions[[agent]],
-                reward,
-                view(next_observation, agent, self.spec),
-                terminated,
-            )
+            obs, next_obs = (view(o, agent, self.spec) for o in (observation, next_observation))
+            replay = self.learners[agent % len(self.learners)].replay
+            replay.add(obs, actions[[agent]], reward, next_obs, terminated)
 
     @property
     def ready(self) -> bool:

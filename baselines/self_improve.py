@@ -170,14 +170,9 @@ class SelfImproved(Imitation):
     def episodes(self, landmarks: np.ndarray) -> Episodes:
         """Play one episode per row of landmarks; every n-th row is greedy."""
         greedy = np.arange(len(landmarks)) % self.args.episodes == 0
+        limit = self.args.max_length
         return rollout(
-            self.envs,
-            self.network,
-            landmarks,
-            self.args.max_length,
-            self.inverse_temperature,
-            greedy,
-            self.rng,
+            self.envs, self.network, landmarks, limit, self.inverse_temperature, greedy, self.rng
         )
 
     def label(

@@ -116,10 +116,7 @@ class Run(NamedTuple):
         return read_outcome(self.group, self.folder, self.options.max_cycles)
 
     def check_folder(self) -> None:
-        """Refuse a folder that holds a trial with other options, or anything else.
-
-        Raises a ValueError if its folder holds anything else.
-        """
+        """Raise a ValueError if its folder holds a run with other options, or anything else."""
         folder = self.folder
         if not folder.is_dir():
             return
@@ -212,10 +209,7 @@ class StudyArgs(ABC):
 
 
 def check_distinct(name: str, values: Sequence[str]) -> None:
-    """Refuse a choice of nothing, or of one thing twice.
-
-    Raises a ValueError with the option's name.
-    """
+    """Raise a ValueError, with the option's name, for a choice of nothing or of one thing twice."""
     if not values or len(set(values)) < len(values):
         raise ValueError(f"{name} must be one or more, none twice, got {values!r}")
 

@@ -124,10 +124,8 @@ def run_training(
         "grid": setting.grid.to_text(),
         "training_problems": problems,
     }
-    run, signals = (
-        RunFolder(folder, training.COLUMNS, resume=args.resume is not None),
-        StopSignals(),
-    )
+    run = RunFolder(folder, training.COLUMNS, resume=args.resume is not None)
+    signals = StopSignals()
     try:
         with signals:
             checkpoints = begin(training, setting.grid, run, config)
@@ -210,11 +208,7 @@ def finish(training: Trainable, folder: Path, setting: Setting, unseen: np.ndarr
     evaluations: dict[str, Evaluation] = {}
     if unseen is not None:
         policy = load_policy(folder)  # as it was kept, so perhaps rounded
-        policies = {
-            "network alone": policy,
-            **training.rivals(policy),
-            **rules_of_thumb(setting),
-        }
+        policies = {"network alone": policy, **training.rivals(policy), **rules_of_thumb(setting)}
         optima = find_optima(setting, unseen)
         for line in out_of_reach(setting, optima):
             print(line)

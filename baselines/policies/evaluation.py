@@ -220,15 +220,7 @@ def evaluate(
                 break
     bar.close()
     envs.close()
-    return Evaluation(
-        setting=setting,
-        landmarks=landmarks,
-        success=success,
-        steps=steps,
-        **costs,
-        actions=kept,
-        optima=optima,
-    )
+    return Evaluation(setting, landmarks, success, steps, **costs, actions=kept, optima=optima)
 
 
 def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = None) -> list[Plan]:

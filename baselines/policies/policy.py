@@ -74,10 +74,7 @@ def save_policy(
 
 
 def header(spec: NetworkSpec, grid: Grid | None) -> dict[str, Any]:
-    """Return what a weights file says of its network.
-
-    Raises a ValueError if the network is for another number of cells than the grid has.
-    """
+    """Return what a weights file says of its network; a ValueError if the grid is none for it."""
     spec.check_grid(grid)
     text = ANY_GRID if grid is None else grid.to_text()
     return {"version": WEIGHTS_VERSION, "grid": text, "network": spec.as_dict()}
@@ -127,10 +124,7 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> NetworkPol
 
 
 def check_weights(network: Network, weights: dict[str, torch.Tensor]) -> None:
-    """Refuse weights that are not, one for one, those that a network has.
-
-    Raises a ValueError if one is missing, unknown, of another shape or dtype, or not finite.
-    """
+    """Raise a ValueError unless weights are finite and, one for one, those that a network has."""
     expected = network.state_dict()
     if weights.keys() != expected.keys():
         missing, extra = expected.keys() - weights.keys(), weights.keys() - expected.keys()

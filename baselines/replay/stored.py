@@ -60,13 +60,9 @@ class ReplayMemory:
         terminated: bool,
     ) -> None:
         """Store one transition in place of the oldest one when the memory is full."""
-        row = self.n_added % self.capacity
-        arrays = self.arrays
-        arrays.observations[row] = observation
-        arrays.actions[row] = actions
-        arrays.rewards[row] = reward
-        arrays.next_observations[row] = next_observation
-        arrays.terminated[row] = terminated
+        transition = observation, actions, reward, next_observation, terminated
+        for array, value in zip(self.arrays, transition, strict=True):
+            array[self.n_added % self.capacity] = value
         self.n_added += 1
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:
