@@ -15,14 +15,12 @@ ablation.md and ablation.csv: interquartile means over the seeds with 95 % boots
 Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings, each with a checkpoint.
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
 from baselines import meta_dqn
+from baselines.learning.config import run_script
 from baselines.learning.study import Groups, StudyArgs, check_distinct, run_study
 from mapp_env.validation import check_choice
 
@@ -72,8 +70,4 @@ def main(args: Args, words: Sequence[str] = ()) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        own, others = tyro.cli(Args, description=__doc__, return_unknown_args=True)
-        sys.exit(main(own, others))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__, others=True)

@@ -18,16 +18,14 @@ Ctrl-C (exit code 130) and SIGTERM (143) stop all trainings, each with a checkpo
 """
 
 import itertools
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
-import tyro
-
 from baselines import independent_dqn, meta_dqn
+from baselines.learning.config import run_script
 from baselines.learning.study import Groups, StudyArgs, Train, check_distinct, run_study
 from baselines.learning.summary import Summary, interval
 from mapp_env.validation import check_count
@@ -96,8 +94,4 @@ def draw(out: Path, summaries: Sequence[Summary]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        own, others = tyro.cli(Args, description=__doc__, return_unknown_args=True)
-        sys.exit(main(own, others))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__, others=True)

@@ -16,7 +16,6 @@ Command::
 Output: a run folder as of meta_dqn.py (no figures), with a row of metrics.csv per 100 updates.
 """
 
-import sys
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -24,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.learning.config import Units, UnitsOrNone, own_options, parse_options
+from baselines.learning.config import Units, UnitsOrNone, own_options, run_script
 from baselines.learning.exact_values import steps_left
 from baselines.learning.imitation import Imitation, ImitationOptions, good_actions_loss, start_of
 from baselines.learning.ranges import Share, Within
@@ -42,12 +41,12 @@ from baselines.policies.settings import N_ACTIONS, Setting, read_setting
 from baselines.replay.imagined import ImaginedReplay
 from baselines.runs.checkpoints import part
 from mapp_env import Grid
+from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.grids import find_grid
 from mapp_env.validation import check_count
 
 ALGORITHM = "distill"
 MAX_MISTAKES = 4096  # states that wait to come again; the oldest is forgotten
-MAX_CELLS = 4096  # of whose distances there is a table
 
 
 # -- configuration -----------------------------------------------------------------------------
@@ -98,8 +97,9 @@ class Distilled(Imitation):
     args: Args
 
     def __init__(self, args: Args, grid: Grid, start: Network | None = None) -> None:
-        if grid.n_cells > MAX_CELLS:
-            raise ValueError(f"grid must have at most {MAX_CELLS:,} cells, got {grid.n_cells:,}")
+        most = MAX_ALL_PAIRS_CELLS
+        if grid.n_cells > most:
+            raise ValueError(f"grid must have at most {most:,} cells, got {grid.n_cells:,}")
         check_count("n_landmarks", args.n_landmarks, 1, grid.reachable.size)
         seeds, states = np.random.SeedSequence(args.seed).spawn(2)
         spec = spec_from_options(args, "pairs", grid, outputs="joint")
@@ -170,7 +170,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(parse_options(Args, __doc__ or "")))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

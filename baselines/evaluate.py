@@ -19,12 +19,13 @@ that can be there first, one landmark after another, on its way from those it al
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-import tyro
 
+from baselines.learning.config import run_script
+from baselines.learning.ranges import Share, Within, check_options
 from baselines.policies.acting import Acting
 from baselines.policies.evaluation import (
     EVALUATION_SEED,
@@ -44,7 +45,7 @@ from baselines.policies.guidance import Guidance, GuidedPolicy
 from baselines.policies.rules_of_thumb import RULES, RandomPolicy, rules_of_thumb
 from baselines.policies.settings import N_ACTIONS, Setting, load_run
 from mapp_env.grids import find_grid
-from mapp_env.validation import check_count, check_number
+from mapp_env.validation import check_count
 
 RIVALS = ("random", *RULES)
 SETTING = ("grid", "n_agents", "n_landmarks", "max_cycles")
@@ -60,9 +61,9 @@ class Args:
     problems: int | Literal["universe"] = 1000
     """number of distinct problems, none of them a training problem of the run; or "universe": all
     problems of the grid, training problems too"""
-    seed: int = EVALUATION_SEED
+    seed: Annotated[int, Within(0, 2**63 - 1)] = EVALUATION_SEED
     """seed of the problems and of everything random in the policy"""
-    guidance: float = 0.0
+    guidance: Share = 0.0
     """probability that an agent with a close unvisited landmark in sight is sent there instead"""
     guidance_reach: int | None = None
     """with guidance: how many moves away a landmark is still close (3)"""
@@ -78,7 +79,7 @@ class Args:
     own"""
     out: Path | None = None
     """folder for evaluation.csv and evaluation.md; nothing is written without it"""
-    threads: int = 1
+    threads: Annotated[int, Within(1, 1024)] = 1
     """threads of PyTorch"""
     device: str = "cpu"
     """where the policy's network computes, as PyTorch names it"""
@@ -86,9 +87,7 @@ class Args:
     def __post_init__(self) -> None:
         if self.problems != "universe":
             check_count("problems", self.problems, 1, 1_000_000)
-        check_count("seed", self.seed, 0, 2**63 - 1)
-        check_number("guidance", self.guidance, 0.0, 1.0)
-        check_count("threads", self.threads, 1, 1024)
+        check_options(self)
         if self.guidance == 0 and self.guidance_reach is not None:
             raise ValueError("guidance_reach has no effect with guidance 0: leave it out")
         brought = [name for name in SETTING if getattr(self, name) is not None]
@@ -190,7 +189,4 @@ def worst_cases(evaluation: Evaluation) -> list[str]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

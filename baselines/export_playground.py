@@ -97,11 +97,7 @@ def _lines(value: object) -> str:
 
 
 def check_runs(policy: str, run: PolicyOfRun) -> None:
-    """Refuse a policy of another task than the page shows, or a network that it has no code for.
-
-    Raises a ValueError if grid, number of agents, landmarks or step limit differ from the default
-    setting's; or if it is not one network of kind "pairs" for all agents, with joint outputs.
-    """
+    """Raise a ValueError for another task than the page shows, or a network it has no code for."""
     shown = Setting(make_grid())
     if run.setting.grid != shown.grid:
         raise ValueError(

@@ -11,8 +11,7 @@ again from any run, a stopped one too. Figure 4 (routes) is drawn when a trainin
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
+from baselines.learning.config import run_script
 from baselines.policies.figures import draw_learning_curves
 
 
@@ -26,10 +25,10 @@ class Args:
     """episodes in the running mean"""
 
 
+def main(args: Args) -> None:
+    """Draw the figures, and print where they are."""
+    print(*draw_learning_curves(args.run, args.window), sep="\n")
+
+
 if __name__ == "__main__":
-    arguments = tyro.cli(Args, description=__doc__)
-    try:
-        for drawn in draw_learning_curves(arguments.run, arguments.window):
-            print(drawn)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

@@ -20,19 +20,19 @@ fine-tuned, and it is said of how many the optimum was found.
 """
 
 import copy
-import sys
 import time
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
-import tyro
 from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from baselines import solve as solving
+from baselines.learning.config import run_script
 from baselines.learning.q_learning import joint_values
+from baselines.learning.ranges import Within, check_options
 from baselines.networks import MAX_JOINT_ACTIONS, Network, split_joint
 from baselines.policies import play
 from baselines.policies.acting import check_grid
@@ -50,7 +50,6 @@ from baselines.replay.imagined import UNKNOWN, join
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 from mapp_env.engine.loops import visit_rows
 from mapp_env.engine.task import make_world
-from mapp_env.validation import check_count, check_number
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
 # at inverse temperatures from one end to the other, episode by episode.
@@ -62,32 +61,25 @@ LEARNING = ("imagined", "updates_per_episode", "learning_rate", "patience")
 class Args(solving.Args):
     """Options of fine-tuning."""
 
-    problems: int = 0
+    problems: Annotated[int, Within(0, 1_000_000)] = 0
     """in place of landmarks: number of random problems to try, none of them solved optimally"""
-    episodes: int = 30
+    episodes: Annotated[int, Within(1, 30)] = 30
     """most episodes to play"""
-    random_episodes: int = 8
+    random_episodes: Annotated[int, Within(0, 29)] = 8
     """number of random-walk episodes after the first"""
-    imagined: int = 4096
+    imagined: Annotated[int, Within(1, 65_536)] = 4096
     """episodes imagined before each of the others"""
-    updates_per_episode: int = 10
+    updates_per_episode: Annotated[int, Within(1, 10_000)] = 10
     """updates after that"""
-    learning_rate: float = 0.002
+    learning_rate: Annotated[float, Within(1e-12, 1.0)] = 0.002
     """step size of Adam"""
-    patience: int = 5
+    patience: Annotated[int, Within(1, 30)] = 5
     """stop after this many of its own episodes without improvement"""
-    seed: int = 0
+    seed: Annotated[int, Within(0, 2**63 - 1)] = 0
     """seed of everything random"""
 
     def __post_init__(self) -> None:
-        check_count("problems", self.problems, 0, 1_000_000)
-        check_count("episodes", self.episodes, 1, 30)
-        check_count("random_episodes", self.random_episodes, 0, 29)
-        check_count("imagined", self.imagined, 1, 65_536)
-        check_count("updates_per_episode", self.updates_per_episode, 1, 10_000)
-        check_number("learning_rate", self.learning_rate, 1e-12, 1.0)
-        check_count("patience", self.patience, 1, 30)
-        check_count("seed", self.seed, 0, 2**63 - 1)
+        check_options(self)
         beside = ("landmarks", "picture", "plan", "animation")
         for name in beside if self.problems else ():
             if getattr(self, name):
@@ -109,17 +101,7 @@ class Episode(NamedTuple):
 
 
 class Tuner:
-    """A network, what it knows of the grid, and the problem it is trained on.
-
-    Parameters
-    ----------
-    args
-        Options.
-    network
-        Whose values tell good joint actions from bad ones; it is copied.
-    problem
-        The problem.
-    """
+    """A copy of a network, what it knows of the grid, and the problem it is trained on."""
 
     def __init__(self, args: Args, network: Network, problem: Problem) -> None:
         spec = network.spec
@@ -283,7 +265,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Args, description=__doc__)))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

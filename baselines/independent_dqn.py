@@ -42,7 +42,6 @@ Command::
 Output: a run folder as of meta_dqn.py; policy.safetensors holds the networks of all agents.
 """
 
-import sys
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -51,7 +50,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
-from baselines.learning.config import Options, parse_options
+from baselines.learning.config import Options, run_script
 from baselines.learning.q_learning import (
     QLearner,
     action_values,
@@ -77,7 +76,7 @@ from baselines.policies.policy import NetworkPolicy
 from baselines.replay.own_imagined import OwnImaginedReplay
 from baselines.replay.relabelled import RelabelledReplay
 from baselines.replay.stored import Batch, ReplayMemory
-from baselines.runs.checkpoints import part
+from baselines.runs.checkpoints import joined, part
 from mapp_env import Grid
 
 ALGORITHM = "independent_dqn"
@@ -165,13 +164,7 @@ class AgentLearner(QLearner):
         return batch, targets
 
     def update(self, progress: float) -> float:
-        """One step of Adam down the Huber loss of a batch; return the loss.
-
-        Parameters
-        ----------
-        progress
-            Part of the training that is over, 0 to 1.
-        """
+        """One step of Adam down the Huber loss of a batch, at a part of the training (0 to 1)."""
         args = self.args
         batch, targets = self.prepared or self.sample(progress)
         self.prepared = self.sample(progress) if self.ahead else None
@@ -221,13 +214,9 @@ class IndependentLearners:
     ) -> None:
         """Store for every agent what that agent saw, did and got; never what the others did."""
         for agent in range(self.spec.n_agents):
-            self.learners[agent % len(self.learners)].replay.add(
-                view(observation, agent, self.spec),
-                actions[[agent]],
-                reward,
-                view(next_observation, agent, self.spec),
-                terminated,
-            )
+            obs, next_obs = (view(o, agent, self.spec) for o in (observation, next_observation))
+            replay = self.learners[agent % len(self.learners)].replay
+            replay.add(obs, actions[[agent]], reward, next_obs, terminated)
 
     @property
     def ready(self) -> bool:
@@ -251,11 +240,7 @@ class IndependentLearners:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""
-        return {
-            f"{index}.{name}": array
-            for index, learner in enumerate(self.learners)
-            for name, array in learner.arrays().items()
-        }
+        return joined({str(i): learner.arrays() for i, learner in enumerate(self.learners)})
 
     def state(self) -> dict[str, Any]:
         """Return all other state, as JSON-ready values."""
@@ -274,7 +259,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(parse_options(Args, __doc__ or "")))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

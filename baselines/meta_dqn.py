@@ -29,7 +29,6 @@ optima), the paper's figures 2, 3 and 4, timing.json and checkpoints. Ctrl-C (ex
 SIGTERM (143) end a run early and leave a checkpoint.
 """
 
-import sys
 from typing import Any
 
 import numpy as np
@@ -37,7 +36,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import smooth_l1_loss
 
-from baselines.learning.config import Options, parse_options
+from baselines.learning.config import Options, run_script
 from baselines.learning.q_learning import (
     QLearner,
     action_values,
@@ -146,13 +145,7 @@ class MetaLearner(QLearner):
         return batch, targets
 
     def update(self, progress: float) -> float:
-        """One step of Adam down the Huber loss of a batch; return the loss.
-
-        Parameters
-        ----------
-        progress
-            Part of the training that is over, 0 to 1.
-        """
+        """One step of Adam down the Huber loss of a batch, at a part of the training (0 to 1)."""
         args = self.args
         batch, targets = self.prepared or self.sample(progress)
         self.prepared = self.sample(progress) if self.ahead else None
@@ -192,7 +185,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(parse_options(Args, __doc__ or "")))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

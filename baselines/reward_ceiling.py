@@ -18,19 +18,20 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-import tyro
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.learning.config import REWARDS
+from baselines.learning.config import REWARDS, run_script
+from baselines.learning.ranges import Share, Within, check_options
 from baselines.policies.evaluation import EVALUATION_SEED, find_optima, unseen_problems
 from baselines.policies.settings import N_ACTIONS, Setting
 from mapp_env.engine.loops import visit_rows
 from mapp_env.engine.rules import Reward
 from mapp_env.engine.task import make_world
 from mapp_env.grids import find_grid
-from mapp_env.validation import check_choice, check_count, check_number
+from mapp_env.validation import check_choice
 
 MAX_STATES = 2**26  # half a gigabyte of values
 SAME = 1e-9  # values closer than this are a tie
@@ -67,10 +68,7 @@ class RewardModel:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return what the rules make of moving to places (B, N), with the set of before, or (B,).
 
-        Returns
-        -------
-        left, rewards
-            (B,) the set of landmarks that are unvisited then (R5), and the rewards (R6).
+        These are the set of landmarks that are unvisited then (R5), and the reward (R6): (B,) each.
         """
         visited = (np.broadcast_to(unvisited, len(places))[:, None] & self.bits) == 0
         visited, rewards, _ = visit_rows(self.world, self.cells[places], self.landmarks, visited)
@@ -173,31 +171,26 @@ class Args:
 
     rewards: tuple[str, ...] = REWARDS
     """which rewards (rule R6)"""
-    discount: float = 0.95
+    discount: Share = 0.95
     """discount factor of future rewards; the paper's is 0.95. One too small for the step limit is
     refused, as values could not tell late steps apart"""
-    problems: int = 100
+    problems: Annotated[int, Within(1, 1_000_000)] = 100
     """number of random problems: one takes about a second for each reward"""
-    seed: int = EVALUATION_SEED
+    seed: Annotated[int, Within(0, 2**63 - 1)] = EVALUATION_SEED
     """seed of the problems"""
     grid: str = "paper-7x7"
     """bundled grid or map file"""
-    n_agents: int = 3
+    n_agents: Annotated[int, Within(1, 16)] = 3
     """number of agents"""
-    n_landmarks: int = 5
+    n_landmarks: Annotated[int, Within(1, 256)] = 5
     """number of landmarks in each problem"""
-    max_cycles: int = 50
+    max_cycles: Annotated[int, Within(1, 1_000_000)] = 50
     """steps after which a problem counts as unsolved"""
 
     def __post_init__(self) -> None:
         for reward in self.rewards:
             check_choice("rewards", reward, REWARDS)
-        check_number("discount", self.discount, 0.0, 1.0)
-        check_count("problems", self.problems, 1, 1_000_000)
-        check_count("seed", self.seed, 0, 2**63 - 1)
-        check_count("n_agents", self.n_agents, 1, 16)
-        check_count("n_landmarks", self.n_landmarks, 1, 256)
-        check_count("max_cycles", self.max_cycles, 1, 1_000_000)
+        check_options(self)
         # The last step counts so much at the start; if it is lost in the values, all is a tie.
         if self.discount**self.max_cycles < LEAST_WEIGHT:
             raise ValueError(
@@ -258,7 +251,4 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Args, description=__doc__))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

@@ -21,7 +21,6 @@ Command::
 Output: a run folder as of meta_dqn.py (no figures), with a row of metrics.csv per 100 updates.
 """
 
-import sys
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -29,7 +28,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.learning.config import own_options, parse_options
+from baselines.learning.config import own_options, run_script
 from baselines.learning.imitation import Imitation, ImitationOptions, good_actions_loss, start_of
 from baselines.learning.ranges import Positive, Share, Within
 from baselines.learning.train import run_training
@@ -171,34 +170,23 @@ class SelfImproved(Imitation):
     def episodes(self, landmarks: np.ndarray) -> Episodes:
         """Play one episode per row of landmarks; every n-th row is greedy."""
         greedy = np.arange(len(landmarks)) % self.args.episodes == 0
+        limit = self.args.max_length
         return rollout(
-            self.envs,
-            self.network,
-            landmarks,
-            self.args.max_length,
-            self.inverse_temperature,
-            greedy,
-            self.rng,
+            self.envs, self.network, landmarks, limit, self.inverse_temperature, greedy, self.rng
         )
 
     def label(
         self,
-        landmarks: np.ndarray,
-        obs: np.ndarray,
-        joint: np.ndarray,
-        lengths: np.ndarray,
-        chosen: np.ndarray,
+        landmarks: np.ndarray,  # (P, K); with the next three an episode on each problem
+        obs: np.ndarray,  # (T, P, D)
+        joint: np.ndarray,  # (T, P)
+        lengths: np.ndarray,  # (P,)
+        chosen: np.ndarray,  # (T, P) bool
     ) -> Labelled:
         """Return which likely actions are as good as those taken in some states of episodes.
 
         Each episode is played again up to the state, then with another action, then greedily.
-
-        Parameters
-        ----------
-        landmarks, obs, joint, lengths
-            (P, K), (T, P, D), (T, P) and (P,): an episode on each problem.
-        chosen
-            (T, P) bool, in which states; the first that the environments have room for.
+        The states are the first of those chosen that the environments have room for.
         """
         spec, n_envs = self.spec, self.envs.num_envs
         n_tried = min(self.args.alternatives, spec.n_joint_actions)
@@ -284,7 +272,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(parse_options(Args, __doc__ or "")))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

@@ -10,14 +10,13 @@ the policy's plan as a JSON file that ``mapp_env.Plan.load`` reads. Exit code 1 
 not solve the problem.
 """
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-import tyro
 
+from baselines.learning.config import run_script
 from baselines.policies import play
 from baselines.policies.settings import load_run
 from mapp_env import Plan, Problem, solve
@@ -106,7 +105,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Args, description=__doc__)))
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from error
+    run_script(main, Args, __doc__)

@@ -2,10 +2,10 @@
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 
 import tyro
 
@@ -260,22 +260,10 @@ def preset_options(kind: type[Chosen], preset: str, **changes: Any) -> Chosen:
 def parse_options(
     kind: type[Chosen], description: str, words: Sequence[str] | None = None
 ) -> Chosen:
-    """Read the options from a command line; the preset gives those not set.
+    """Read the options from a command line, by default this process's; the preset gives the others.
 
-    Parameters
-    ----------
-    kind
-        Of the options.
-    description
-        Shown with the help.
-    words
-        The command line, by default that of this process.
-
-    Raises
-    ------
-    ValueError
-        If an option is given that another leaves without effect, or any beside ``resume``, even
-        if it has the run's own value.
+    Raises a ValueError if an option is given that another leaves without effect, or any beside
+    ``resume``, even if it has the run's own value.
     """
     words = [_current(word) for word in (sys.argv[1:] if words is None else words)]
     preset = "default"
@@ -304,6 +292,22 @@ def _current(word: str) -> str:
 def option_name(word: str) -> str:
     """Return the name of the option that a word of a command line sets."""
     return word.partition("=")[0].removeprefix("--").replace("-", "_").removeprefix("no_")
+
+
+def run_script(
+    main: Callable[..., int | None], kind: type, description: str | None, others: bool = False
+) -> NoReturn:
+    """Read a script's options, run it, and exit: with code 1 and a line if something is refused.
+
+    With `others`, words of the command line that are no options of its own are given to it, too.
+    """
+    try:
+        if issubclass(kind, RunOptions):
+            sys.exit(main(parse_options(kind, description or "")))
+        read = tyro.cli(kind, description=description, return_unknown_args=others)
+        sys.exit(main(*read) if others else main(read))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from error
 
 
 # -- a run that is resumed ---------------------------------------------------------------------

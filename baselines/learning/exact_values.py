@@ -13,23 +13,13 @@ from mapp_env.grid import FAR
 
 
 def steps_left(
-    cells: np.ndarray,
-    landmarks: np.ndarray,
-    visited: np.ndarray,
-    moves: np.ndarray,
-    distances: np.ndarray,
+    cells: np.ndarray,  # (B, N) int64; with the next two the states
+    landmarks: np.ndarray,  # (B, K) int64
+    visited: np.ndarray,  # (B, K) bool
+    moves: np.ndarray,  # (C, A) int64, where each action leads from each cell
+    distances: np.ndarray,  # (C, C) int64 shortest-path steps
 ) -> np.ndarray:
-    """Return the least steps to cover the rest after each joint action: (B, A ** N) int32.
-
-    Parameters
-    ----------
-    cells, landmarks, visited
-        (B, N), (B, K) int64 and (B, K) bool: the states.
-    moves
-        (C, A) int64, where each action leads from each cell.
-    distances
-        (C, C) int64 shortest-path steps.
-    """
+    """Return the least steps to cover the rest after each joint action: (B, A ** N) int32."""
     n_agents, n_actions = cells.shape[1], moves.shape[1]
     out = np.empty((len(cells), n_actions**n_agents), np.int32)
     _steps_left(cells, landmarks, visited, moves, distances, out)

@@ -44,17 +44,7 @@ class ImitationOptions(RunOptions):
 
 
 class Imitation(Trainable):
-    """A network, its optimiser, and the states and joint actions that it learns from.
-
-    Parameters
-    ----------
-    args
-        Options.
-    network
-        What is trained.
-    rng
-        Source of everything random.
-    """
+    """A network, its optimiser, and the states and joint actions that it learns from."""
 
     UNIT, COLUMNS, SHOWN = "updates", METRICS, ("loss",)
     args: ImitationOptions
@@ -150,14 +140,9 @@ class Imitation(Trainable):
 
 
 def good_actions_loss(scores: Tensor, good: Tensor) -> Tensor:
-    """Return minus the log-probability of taking a good action, its mean over states.
+    """Return minus the log-probability of taking a good joint action, its mean over states.
 
-    Parameters
-    ----------
-    scores
-        (B, A ** N) the network's output, read as logits.
-    good
-        (B, A ** N) bool, which joint actions are good; at least one in each state.
+    `scores` (B, A ** N) are read as logits; in each state at least one action is `good`.
     """
     of_good = scores.masked_fill(~good, -torch.inf).logsumexp(1)
     return (scores.logsumexp(1) - of_good).mean()

@@ -17,7 +17,7 @@ from baselines.networks import Network, NetworkSpec
 from baselines.replay.imagined import ImaginedReplay
 from baselines.replay.relabelled import RelabelledReward, relabelled_reward
 from baselines.replay.stored import Batch, ReplayMemory
-from baselines.runs.checkpoints import part
+from baselines.runs.checkpoints import joined, part
 from mapp_env import Grid
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 
@@ -75,16 +75,9 @@ def action_values(network: Network, observations: Tensor) -> Tensor:
 
 
 def chosen_values(values: Tensor, actions: Tensor, spec: NetworkSpec) -> Tensor:
-    """Return the values of the actions taken: (B, T) of joint ones, (B, T, N) of agents'.
+    """Return the values of the actions taken (B, T, N), one per agent.
 
-    Parameters
-    ----------
-    values
-        (B, A ** N) or (B, N, A).
-    actions
-        (B, T, N), one action per agent.
-    spec
-        Of the network.
+    Of joint values (B, A ** N) they are (B, T), of agents' values (B, N, A) they are (B, T, N).
     """
     if spec.outputs == "joint":
         weights = spec.n_actions ** torch.arange(spec.n_agents - 1, -1, -1)
@@ -106,17 +99,11 @@ def over_joint_actions(parts: Tensor, combine: Callable[[Tensor, Tensor], Tensor
 
 
 def next_values(values: Tensor, chooser: Tensor, known: np.ndarray | None) -> Tensor:
-    """Return the value of the best action, (...) or (..., N).
+    """Return the target network's value of the best action: (...), or (..., N) of each agent's.
 
-    Parameters
-    ----------
-    values
-        (..., A ** N) or (..., N, A), the target network's.
-    chooser
-        The same of the network that picks the action: the target network's own, or (double
-        DQN, van Hasselt et al. 2016) the trained one's.
-    known
-        (..., N, A) bool, the actions that may be picked; None for all.
+    `values` are its (..., A ** N) or (..., N, A); `chooser` are those of the network that picks the
+    action: its own, or (double DQN, van Hasselt et al. 2016) the trained one's. `known` (..., N, A)
+    are the actions that may be picked; None for all.
     """
     if known is not None:
         allowed = torch.from_numpy(known)
@@ -133,19 +120,10 @@ def next_values(values: Tensor, chooser: Tensor, known: np.ndarray | None) -> Te
 def td_targets(rewards: Tensor, terminated: Tensor, next_values: Tensor, discount: float) -> Tensor:
     """Return the TD targets of the chosen values.
 
-    With a value for each joint action that is the reward and the best value of the next state.
-    With values for each agent's actions every agent gets the team reward, and goes on with the
-    best of its own. After a termination nothing follows; after a truncation the episode would have
-    gone on.
-
-    Parameters
-    ----------
-    rewards, terminated
-        (...) the team reward; whether the episode ended because all landmarks were visited.
-    next_values
-        (...) or (..., N) the value of the next states.
-    discount
-        Discount factor.
+    With a value for each joint action, `next_values` (...), that is the team reward (...) and the
+    best value of the next state. With values for each agent's actions, (..., N), every agent gets
+    the team reward, and goes on with the best of its own. After a termination (all landmarks
+    visited) nothing follows; after a truncation the episode would have gone on.
     """
     follows = discount * (~terminated).to(rewards.dtype)
     if next_values.dim() > rewards.dim():
@@ -177,18 +155,7 @@ def move_target(target: Network, network: Network, args: Options, updates: int) 
 class QLearner:
     """A network, its target network, optimiser and random numbers; and their checkpoints.
 
-    Parameters
-    ----------
-    args
-        Options.
-    grid
-        The grid.
-    network, target
-        Two networks of one kind; the target starts as the network's copy.
-    replay
-        The replay buffer.
-    rng
-        Source of all batches.
+    The target, a network of the same kind, starts as a copy; all batches are drawn with `rng`.
     """
 
     def __init__(
@@ -237,11 +204,7 @@ class QLearner:
         if self.prepared is not None:
             batch, targets = self.prepared
             parts["prepared"] = {**batch._asdict(), "targets": targets.cpu().numpy()}
-        return {
-            f"{part}.{name}": array
-            for part, arrays in parts.items()
-            for name, array in arrays.items()
-        }
+        return joined(parts)
 
     def state(self) -> dict[str, Any]:
         """Return all other state, as JSON-ready values."""

@@ -19,10 +19,7 @@ Positive = Annotated[float, Within(1e-6, 1e6)]
 
 
 def check_options(options: Any) -> None:
-    """Refuse values that the annotations of a dataclass do not allow.
-
-    Raises a ValueError if a number is out of its range, or a flag or choice is none.
-    """
+    """Raise a ValueError for a value that the annotations of a dataclass do not allow."""
     for name, (kind, *metadata) in _annotations(options.__class__).items():
         value = getattr(options, name)
         if kind is bool:

@@ -116,10 +116,7 @@ class Run(NamedTuple):
         return read_outcome(self.group, self.folder, self.options.max_cycles)
 
     def check_folder(self) -> None:
-        """Refuse a folder that holds a trial with other options, or anything else.
-
-        Raises a ValueError if its folder holds anything else.
-        """
+        """Raise a ValueError if its folder holds a run with other options, or anything else."""
         folder = self.folder
         if not folder.is_dir():
             return
@@ -212,41 +209,22 @@ class StudyArgs(ABC):
 
 
 def check_distinct(name: str, values: Sequence[str]) -> None:
-    """Refuse a choice of nothing, or of one thing twice.
-
-    Raises a ValueError with the option's name.
-    """
+    """Raise a ValueError, with the option's name, for a choice of nothing or of one thing twice."""
     if not values or len(set(values)) < len(values):
         raise ValueError(f"{name} must be one or more, none twice, got {values!r}")
 
 
 def run_study(
     args: StudyArgs,
-    words: Sequence[str],
-    table: str,
-    columns: Sequence[str],
-    train: Train | None = None,
+    words: Sequence[str],  # options for each of its runs
+    table: str,  # name of the tables
+    columns: Sequence[str],  # titles of the cells that name a group
+    train: Train | None = None,  # returns what went wrong, a line for each; default: train_all
 ) -> tuple[int, list[Summary]]:
     """Train what is not finished, add up, write and print the tables.
 
-    Parameters
-    ----------
-    args, words
-        Options of the study, and those for each of its runs.
-    table, columns
-        Name of the tables, and titles of the cells that name a group.
-    train
-        Trains, and returns what went wrong, a line for each; by default :func:`train_all`.
-
-    Returns
-    -------
-    int, list of Summary
-        The exit code, and what came out of each group if it is 0.
-
-    Raises
-    ------
-    ValueError
-        If an option is refused, the folder cannot be written into, or a training has failed.
+    Returns the exit code, and what came out of each group if it is 0. Raises a ValueError if an
+    option is refused, the folder cannot be written into, or a training has failed.
     """
     runs, signals = args.plan(words), StopSignals()
     train = train or partial(train_all, jobs=args.jobs)

@@ -45,14 +45,7 @@ from mapp_env import Grid
 class Trainable(Resumable, ABC):
     """A training that can be stopped between any two steps or updates, and carried on.
 
-    Parameters
-    ----------
-    args
-        Options.
-    total
-        Episodes or updates of the whole training.
-    weights_interval
-        How many of them lie between two times that the weights are written.
+    It is of `total` episodes or updates; the weights are written after every `weights_interval`.
     """
 
     UNIT: ClassVar[str]  # what is counted: episodes or updates
@@ -110,23 +103,10 @@ def run_training(
 ) -> int:
     """Train, evaluate, draw; return the exit code.
 
-    Parameters
-    ----------
-    args
-        Options, of a resumed run its own.
-    algorithm
-        Name of the run's kind.
-    setting
-        What the agents have to do.
-    problems
-        Those trained on; they are none of those evaluated.
-    make_training
-        Builds what is trained.
+    The options are a resumed run's own; none of the problems trained on is evaluated.
 
-    Raises
-    ------
-    ValueError
-        If an option or the folder cannot be used, or the folder cannot be written into.
+    Raises a ValueError if an option or the folder cannot be used, or the folder cannot be written
+    into.
     """
     torch.set_num_threads(args.threads)
     # Validate everything before anything is written.
@@ -144,10 +124,8 @@ def run_training(
         "grid": setting.grid.to_text(),
         "training_problems": problems,
     }
-    run, signals = (
-        RunFolder(folder, training.COLUMNS, resume=args.resume is not None),
-        StopSignals(),
-    )
+    run = RunFolder(folder, training.COLUMNS, resume=args.resume is not None)
+    signals = StopSignals()
     try:
         with signals:
             checkpoints = begin(training, setting.grid, run, config)
@@ -230,11 +208,7 @@ def finish(training: Trainable, folder: Path, setting: Setting, unseen: np.ndarr
     evaluations: dict[str, Evaluation] = {}
     if unseen is not None:
         policy = load_policy(folder)  # as it was kept, so perhaps rounded
-        policies = {
-            "network alone": policy,
-            **training.rivals(policy),
-            **rules_of_thumb(setting),
-        }
+        policies = {"network alone": policy, **training.rivals(policy), **rules_of_thumb(setting)}
         optima = find_optima(setting, unseen)
         for line in out_of_reach(setting, optima):
             print(line)

@@ -89,16 +89,7 @@ class Progress:
 class Training(Trainable):
     """Episodes, the updates that are due after steps and episodes, and what is logged.
 
-    Parameters
-    ----------
-    args
-        Options.
-    grid
-        The grid.
-    problems
-        (P, K) landmark cells, a training problem per row.
-    learner
-        What is trained.
+    Trained is the learner, on each of the problems: (P, K) landmark cells.
     """
 
     UNIT, COLUMNS, SHOWN = "episodes", METRICS, ("steps", "reward")
@@ -108,11 +99,7 @@ class Training(Trainable):
         super().__init__(args, args.n_episodes, args.episodes_per_problem)
         self.problems, self.learner = problems, learner
         self.env = mapp_v0.parallel_env(
-            grid=grid,
-            n_agents=args.n_agents,
-            n_landmarks=args.n_landmarks,
-            max_cycles=args.max_cycles,
-            reward=args.reward,
+            grid, args.n_agents, args.n_landmarks, args.max_cycles, args.reward
         )
         self.leader = self.env.possible_agents[0]  # the same for all agents
         self.rng = np.random.default_rng(Streams.spawn(args.seed).acting)
@@ -291,12 +278,8 @@ class Training(Trainable):
 
 def training_problems(args: Options, grid: Grid) -> np.ndarray:
     """Draw the problems of a training, from its seed: (P, K)."""
-    return sample_problems(
-        grid,
-        args.n_problems,
-        n_landmarks=args.n_landmarks,
-        seed=int(Streams.spawn(args.seed).problems.generate_state(1)[0]),
-    )
+    seed = int(Streams.spawn(args.seed).problems.generate_state(1)[0])
+    return sample_problems(grid, args.n_problems, n_landmarks=args.n_landmarks, seed=seed)
 
 
 def train_learner(

@@ -52,12 +52,8 @@ CENTRAL = tuple(kind for kind, network in NETWORKS.items() if network.spec_type.
 def network_spec(kind: str, *sizes: Any, **options: Any) -> NetworkSpec:
     """Return the spec of a kind of network, a key of NETWORKS.
 
-    Raises
-    ------
-    ValueError
-        If there is no such kind, or one of its fields is invalid.
-    TypeError
-        If it has no such field.
+    Raises a ValueError if there is no such kind, or one of its fields is invalid; a TypeError if it
+    has no such field.
     """
     check_choice("kind", kind, tuple(NETWORKS))
     return NETWORKS[kind].spec_type(*sizes, **options)

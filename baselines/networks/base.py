@@ -91,10 +91,7 @@ class NetworkSpec:
         return self.observation_size + (self.n_agents if self.told_agent else 0)
 
     def check_grid(self, grid: Grid | None) -> None:
-        """Refuse a grid that the network cannot be for; None is any grid.
-
-        Raises a ValueError if it does not have the network's number of cells.
-        """
+        """Raise a ValueError if a grid, None for any, has not the network's number of cells."""
         if self.n_cells not in (ANY, ANY if grid is None else grid.n_cells):
             found = "any grid" if grid is None else f"one of {grid.n_cells}"
             raise ValueError(f"grid must have the network's {self.n_cells} cells, got {found}")
@@ -107,12 +104,7 @@ class NetworkSpec:
 class Network(nn.Module):
     """A network from global observations to action values.
 
-    Parameters
-    ----------
-    spec
-        What is built.
-    generator
-        Source of the initial weights; on the device "meta", where there are none, None.
+    Its initial weights come from the generator; on the device "meta", where there are none, None.
     """
 
     spec_type: ClassVar[type[NetworkSpec]]

@@ -143,12 +143,8 @@ def _joint_actions_by_order(spec: NetworkSpec) -> Tensor:
 def rows_to_look_up(observations: np.ndarray, spec: PairsSpec) -> tuple[np.ndarray, ...]:
     """Return what is to be looked up for global observations (B, N + 2K).
 
-    Returns
-    -------
-    pairs, landmarks, order
-        From :func:`arrange`.
-    through, between
-        From :func:`routes` and :func:`between_landmarks`; empty without such tables.
+    What :func:`arrange` returns, and of :func:`routes` and :func:`between_landmarks` what has
+    a table.
     """
     n_cells = spec.n_cells
     pairs, landmarks, order = arrange(
@@ -166,20 +162,12 @@ def arrange(observations, n, k, n_cells, sort):  # type: ignore[no-untyped-def]
 
     Two places are added to the grid's cells: where all visited landmarks are put, and one that
     every agent pairs with besides, for what its cell says by itself.
-
-    Returns
-    -------
-    pairs
-        (B, N, K + 1) of each agent, its cell with each landmark's and with the second added place.
-    landmarks
-        (B, K) the landmarks' cells, or the first added place.
-    order
-        (B, N) the agents in the order of `pairs`: with `sort` that of their cells, of equal
-        ones the first.
     """
     n_rows, n_places = len(observations), n_cells + 2
+    # Of each agent, its cell with each landmark's and with the second added place.
     pairs = np.empty((n_rows, n, k + 1), np.int64)
-    landmarks = np.empty((n_rows, k), np.int64)
+    landmarks = np.empty((n_rows, k), np.int64)  # their cells, or the first added place
+    # The agents in the order of pairs: with `sort` that of their cells, of equal ones the first.
     order = np.empty((n_rows, n), np.int64)
     for row in range(n_rows):
         for index in range(k):
@@ -205,14 +193,8 @@ def arrange(observations, n, k, n_cells, sort):  # type: ignore[no-untyped-def]
 def routes(pairs, landmarks, n_cells):  # type: ignore[no-untyped-def]
     """Return the agents' cells with every two unvisited landmarks: (B * N, K (K - 1) / 2).
 
-    A pair with a visited landmark has one row for itself, the last; so has a single landmark.
-
-    Parameters
-    ----------
-    pairs, landmarks
-        (B, N, K + 1) and (B, K), what :func:`arrange` returned.
-    n_cells
-        Cells of the grid.
+    Pairs and landmarks are those of :func:`arrange`. A pair with a visited landmark has one row for
+    itself, the last; so has a single landmark.
     """
     n_rows, n, k = len(pairs), pairs.shape[1], landmarks.shape[1]
     n_two = n_cells * (n_cells - 1) // 2

@@ -14,14 +14,10 @@ class Acting(Protocol):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Return joint actions (B, N) for global observations (B, N + 2K)."""
-        ...
 
 
 def check_grid(policy: object, grid: Grid) -> None:
-    """Refuse a policy that was trained on another grid; one that names none plays on any.
-
-    Raises a ValueError if its grid is another, or it is not known which one it is.
-    """
+    """Raise a ValueError for a policy of another grid; one that names none plays on any."""
     own = getattr(policy, "grid", None)
     if isinstance(own, Grid) and own != grid:
         raise ValueError(

@@ -45,30 +45,15 @@ def begin(
 def rollout(
     envs: gymnasium.vector.VectorEnv,
     network: Network,
-    landmarks: np.ndarray,
-    max_length: int,
+    landmarks: np.ndarray,  # (P, K), each row ascending
+    max_length: int,  # step limit
     inverse_temperature: float,
-    greedy: np.ndarray,
+    greedy: np.ndarray,  # (P,) bool, rows that take the action of the largest value
     rng: np.random.Generator,
 ) -> Episodes:
-    """Play an episode on each row of landmarks.
+    """Play an episode on each row of landmarks, an environment each.
 
-    Parameters
-    ----------
-    envs
-        As many environments as there are rows.
-    network
-        Its values, times the inverse temperature, are the logits of the actions.
-    landmarks
-        (P, K), each row ascending.
-    max_length
-        Steps after which an episode is given up.
-    inverse_temperature
-        The larger, the likelier the action of the largest value.
-    greedy
-        (P,) bool, rows that take the action of the largest value.
-    rng
-        Source of all draws.
+    The network's values, times the inverse temperature, are the logits of the joint actions.
     """
     obs = begin(envs, landmarks)
     spec, n_rows = network.spec, len(landmarks)

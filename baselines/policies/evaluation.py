@@ -163,32 +163,15 @@ class Evaluation:
 def evaluate(
     policy: Acting,
     setting: Setting,
-    landmarks: np.ndarray,
+    landmarks: np.ndarray,  # (P, K) cells, a problem per row
     optima: Optima | None = None,
-    n_kept: int = 0,
-    progress: str | None = None,
+    n_kept: int = 0,  # of how many problems, the first ones, the joint actions are kept
+    progress: str | None = None,  # label of a progress bar, shown in a terminal
 ) -> Evaluation:
-    """Evaluate a policy for one episode on each problem.
+    """Evaluate a policy for one episode on each problem; without optima there are no gaps.
 
-    Parameters
-    ----------
-    policy
-        Who commands the agents.
-    setting
-        Grid, number of agents and landmarks, step limit.
-    landmarks
-        (P, K) landmark cells, a problem per row.
-    optima
-        Of these problems, from :func:`find_optima`; without them there are no gaps.
-    n_kept
-        Of how many problems, the first ones, the joint actions are kept, to be replayed or drawn.
-    progress
-        Label of a progress bar, shown in a terminal; none by default.
-
-    Raises
-    ------
-    ValueError
-        If there is no problem, one is not a problem of the grid, or the policy is of another grid.
+    Raises a ValueError if there is no problem, one is not a problem of the grid, or the policy is
+    of another grid.
     """
     check_count("n_kept", n_kept, 0, 1_000_000)
     check_grid(policy, setting.grid)
@@ -237,15 +220,7 @@ def evaluate(
                 break
     bar.close()
     envs.close()
-    return Evaluation(
-        setting=setting,
-        landmarks=landmarks,
-        success=success,
-        steps=steps,
-        **costs,
-        actions=kept,
-        optima=optima,
-    )
+    return Evaluation(setting, landmarks, success, steps, **costs, actions=kept, optima=optima)
 
 
 def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = None) -> list[Plan]:

@@ -107,23 +107,11 @@ def draw_routes(folder: Path, evaluations: dict[str, Evaluation]) -> list[Path]:
 
 def draw_comparison(
     folder: Path,
-    summaries: Sequence[Any],
-    interval: Callable[[np.ndarray], Any],
-    window: int = 30,
+    summaries: Sequence[Any],  # a summary.Summary for each learner under each preset
+    interval: Callable[[np.ndarray], Any],  # summary.interval: mean over the first axis, and bounds
+    window: int = 30,  # episodes in the running mean of each seed
 ) -> Path:
-    """Draw a comparison: learning curves and final figures over the seeds, a row per preset.
-
-    Parameters
-    ----------
-    folder
-        Where comparison.png is written.
-    summaries
-        A ``summary.Summary`` for each learner under each preset.
-    interval
-        Gives the mean over the first axis, and its interval: ``summary.interval``.
-    window
-        Episodes in the running mean of each seed.
-    """
+    """Draw comparison.png: learning curves and final figures over the seeds, a row per preset."""
     presets = list(dict.fromkeys(summary.group[0] for summary in summaries))
     learners = list(dict.fromkeys(summary.group[1] for summary in summaries))
     figure, grid = plt.subplots(

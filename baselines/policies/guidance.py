@@ -83,10 +83,7 @@ class GuidedPolicy:
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Return joint actions (B, N): the policy's, or the guidance's where an agent obeys it.
 
-        Raises
-        ------
-        ValueError
-            If the observations have another shape or hold numbers that are no cells or flags.
+        Raises a ValueError as :func:`~baselines.policies.acting.check_observations` does.
         """
         guidance = self.guidance
         checked = check_observations(

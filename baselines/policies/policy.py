@@ -30,12 +30,7 @@ PRETRAINED = Path(__file__).parents[1] / "pretrained"  # a folder for each name,
 class NetworkPolicy:
     """Greedy commands of a network: the joint action, or each agent's, of the highest value.
 
-    Parameters
-    ----------
-    network
-        Gives the values.
-    grid
-        The grid it was trained on; None if it plays on any.
+    ``grid`` is the one it was trained on; None if it plays on any.
     """
 
     def __init__(self, network: Network, grid: Grid | None = None) -> None:
@@ -63,22 +58,11 @@ def save_policy(
 ) -> None:
     """Write a network's weights, its spec and its grid to a safetensors file, in one piece.
 
-    Parameters
-    ----------
-    path
-        The file.
-    network
-        The network.
-    grid
-        What it is for; None for a network that plays on any.
-    half_precision
-        In 16 bits each, rounded: half the size, and nearly the same values. Tensors with values
-        that 16 bits have no room for keep theirs.
+    The grid of a network that plays on any is None. With `half_precision` weights are rounded to 16
+    bits: half the size, and nearly the same values; tensors with values that 16 bits have no room
+    for keep theirs.
 
-    Raises
-    ------
-    ValueError
-        If the network is for another number of cells than the grid has.
+    Raises a ValueError if the network is for another number of cells than the grid has.
     """
     # One metadata entry only: safetensors writes several in no fixed order.
     about = json.dumps(header(network.spec, grid), sort_keys=True)
@@ -90,10 +74,7 @@ def save_policy(
 
 
 def header(spec: NetworkSpec, grid: Grid | None) -> dict[str, Any]:
-    """Return what a weights file says of its network.
-
-    Raises a ValueError if the network is for another number of cells than the grid has.
-    """
+    """Return what a weights file says of its network; a ValueError if the grid is none for it."""
     spec.check_grid(grid)
     text = ANY_GRID if grid is None else grid.to_text()
     return {"version": WEIGHTS_VERSION, "grid": text, "network": spec.as_dict()}
@@ -143,10 +124,7 @@ def load_policy(path: str | os.PathLike[str], device: str = "cpu") -> NetworkPol
 
 
 def check_weights(network: Network, weights: dict[str, torch.Tensor]) -> None:
-    """Refuse weights that are not, one for one, those that a network has.
-
-    Raises a ValueError if one is missing, unknown, of another shape or dtype, or not finite.
-    """
+    """Raise a ValueError unless weights are finite and, one for one, those that a network has."""
     expected = network.state_dict()
     if weights.keys() != expected.keys():
         missing, extra = expected.keys() - weights.keys(), weights.keys() - expected.keys()

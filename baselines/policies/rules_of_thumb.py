@@ -20,10 +20,7 @@ class RandomPolicy:
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Return joint actions (B, N), whatever is observed.
 
-        Raises
-        ------
-        ValueError
-            If the observations are not rows of numbers.
+        Raises a ValueError if the observations are not rows of numbers.
         """
         n_rows = len(check_rows(observations))
         return self.rng.integers(self.n_actions, size=(n_rows, self.n_agents))
@@ -48,10 +45,7 @@ class NearestLandmarkPolicy:
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Return joint actions (B, N).
 
-        Raises
-        ------
-        ValueError
-            If the observations have another shape or hold numbers that are no cells or flags.
+        Raises a ValueError as :func:`~baselines.policies.acting.check_observations` does.
         """
         n, k = self.n_agents, self.n_landmarks
         observations = check_observations(observations, n, k, len(self.distances))

@@ -87,10 +87,7 @@ def read_setting(folder: Path) -> tuple[Setting, list[tuple[int, ...]]]:
 
 
 def check_fits(policy: NetworkPolicy, setting: Setting, folder: Path) -> None:
-    """Refuse a run whose config and weights tell of different tasks.
-
-    Raises a ValueError if the grid, or the number of agents, landmarks or actions differ.
-    """
+    """Raise a ValueError if a run's config and weights tell of different tasks."""
     spec = policy.spec
     for name, value in {
         "n_agents": setting.n_agents,

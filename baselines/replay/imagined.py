@@ -30,33 +30,13 @@ UNKNOWN = -1
 
 
 class ImaginedReplay:
-    """Transitions imagined from experienced moves.
+    """Transitions imagined from experienced moves; the grid's walls are read by the rules alone.
 
-    Parameters
-    ----------
-    spec
-        Numbers of agents, landmarks, actions and cells.
-    grid
-        The grid; its walls are read by nothing but the rules.
-    actors
-        The agents whose moves are imagined, by default all.
-    n_rows
-        Episodes imagined side by side: the states of a batch.
-    n_tried
-        Joint actions tried in each state: the best by the values it is given, then others, the
-        more likely the better (Boltzmann).
-    temperature
-        Difference of value at which another action is tried e times less.
-    exploration
-        Probability that an imagined episode follows any of the actions tried, not the best.
-    from_depot
-        Share of the episodes that start at the depot with all landmarks unvisited; the others
-        start anywhere, with any number of landmarks left.
-    max_length
-        Steps after which an imagined episode is given up.
-    retries
-        Probability that an episode that was given up is begun again from the depot, with the same
-        landmarks: so problems that the learner cannot solve stay until it can.
+    In each state joint actions are tried: the best by the values that are given, then others, the
+    more likely the better (Boltzmann). Episodes that do not start at the depot, with all landmarks
+    unvisited, start anywhere, with any number of landmarks left. Those that reach the step limit
+    may begin again from the depot, with the same landmarks: so problems that the learner cannot
+    solve stay until it can.
     """
 
     CHANGING: ClassVar[tuple[str, ...]] = ("moves", "cells", "landmarks", "visited", "ages")
@@ -66,15 +46,15 @@ class ImaginedReplay:
         self,
         spec: NetworkSpec,
         grid: Grid,
-        actors: list[int] | None = None,
+        actors: list[int] | None = None,  # the agents whose moves are imagined, by default all
         *,
-        n_rows: int,
-        n_tried: int = 1,
-        temperature: float = 1.0,
-        exploration: float = 0.0,
-        from_depot: float,
-        max_length: int,
-        retries: float = 0.0,
+        n_rows: int,  # episodes imagined side by side: the states of a batch
+        n_tried: int = 1,  # joint actions in each state
+        temperature: float = 1.0,  # difference of value at which one is tried e times less
+        exploration: float = 0.0,  # probability to follow any action tried, not the best
+        from_depot: float,  # share of the episodes that start there
+        max_length: int,  # step limit of an episode
+        retries: float = 0.0,  # probability to begin one again that reached it
     ) -> None:
         n, k = spec.n_agents, spec.n_landmarks
         self.spec, self.depot = spec, grid.depot
@@ -186,22 +166,8 @@ class ImaginedReplay:
     ) -> tuple[Batch, np.ndarray]:
         """Return a transition for each row and action tried; then let the episodes go on.
 
-        Parameters
-        ----------
-        values
-            (rows, A ** N) float32, what the actors' joint actions are worth in
-            :meth:`observations`.
-        reward
-            How transitions are rewarded.
-        rng
-            Source of all choices.
-
-        Returns
-        -------
-        batch
-            The transitions.
-        followed
-            (rows,) which of the actions tried each episode goes on with.
+        Values (rows, A ** N) float32 are of the actors' joint actions in :meth:`observations`.
+        Returned is also which of the actions tried each episode goes on with, (rows,).
         """
         n_rows = len(self.cells)
         own = self.cells[:, self.actors]

@@ -22,30 +22,16 @@ from baselines.networks import NetworkSpec, view
 from baselines.replay.imagined import UNKNOWN, ImaginedReplay
 from baselines.replay.relabelled import RelabelledReward, draw_landmarks
 from baselines.replay.stored import Batch, ReplayMemory
-from baselines.runs.checkpoints import part
+from baselines.runs.checkpoints import joined, part
 from mapp_env import Grid
 
 
 class OwnImaginedReplay(ImaginedReplay):
     """Transitions imagined from one agent's experienced moves, and the others' observed ways.
 
-    A *moment* is a step that was played, by its number.
-
-    Parameters
-    ----------
-    spec
-        Of the agent's network.
-    grid
-        The grid.
-    agent
-        Which agent it is.
-    capacity
-        Moments that are kept.
-    fresh
-        Share of new imagined episodes that get fresh landmarks; the others get those that were
-        there when the others went where they go.
-    options
-        Those of :class:`ImaginedReplay`, by name; actions are the agent's own.
+    A *moment* is a step that was played, by its number; `capacity` of them are kept. A share of new
+    imagined episodes, `fresh`, get fresh landmarks; the rest get those that were there when the
+    others went where they go. Actions are the agent's own.
     """
 
     CHANGING = (*ImaginedReplay.CHANGING, "moments", "begins")
@@ -59,7 +45,7 @@ class OwnImaginedReplay(ImaginedReplay):
         *,
         capacity: int,
         fresh: float,
-        **options: Any,
+        **options: Any,  # of ImaginedReplay
     ) -> None:
         super().__init__(spec, grid, [agent], **options)
         self.agent, self.fresh = agent, fresh
@@ -174,11 +160,7 @@ class OwnImaginedReplay(ImaginedReplay):
 
     def arrays_by_name(self) -> dict[str, np.ndarray]:
         """Return all that changes."""
-        stored = self.memory.arrays_by_name()
-        return {
-            **super().arrays_by_name(),
-            **{f"memory.{name}": array for name, array in stored.items()},
-        }
+        return super().arrays_by_name() | joined({"memory": self.memory.arrays_by_name()})
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Take over what :meth:`arrays_by_name` returned."""

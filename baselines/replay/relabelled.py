@@ -42,18 +42,9 @@ def relabelled_reward(
 class RelabelledReplay(ReplayMemory):
     """The last transitions of an agent, given fresh landmarks when they are drawn.
 
-    Parameters
-    ----------
-    spec
-        Numbers of agents, landmarks and cells; what the network is given begins with them.
-    depot
-        Where no landmark can be.
-    capacity
-        Transitions that are kept.
-    fresh
-        Share of the transitions drawn that get fresh landmarks; the others keep their own.
-    as_far
-        Share of those of which as many are visited as were; of the others any number.
+    A share of the transitions drawn, `fresh`, get fresh landmarks, none on the depot; the others
+    keep their own. Of a share of those, `as_far`, as many are visited as were; of the others any
+    number.
     """
 
     def __init__(

@@ -21,21 +21,10 @@ class ReplayMemory:
     """The last `capacity` transitions, in arrays that are allocated once.
 
     Only ``terminated`` is kept of an episode's end: a time-out (truncation) says nothing about
-    the state it stopped in, so the learner goes on from there (it bootstraps).
+    the state it stopped in, so the learner goes on from there (it bootstraps). The rewards of
+    a batch are multiplied by `reward_scale`.
 
-    Parameters
-    ----------
-    capacity
-        Transitions that are kept.
-    observation_size, n_agents
-        Numbers in an observation, and in an action.
-    reward_scale
-        What the rewards of a batch are multiplied by.
-
-    Raises
-    ------
-    ValueError
-        If a size is invalid.
+    Raises a ValueError if a size is invalid.
     """
 
     def __init__(
@@ -71,13 +60,9 @@ class ReplayMemory:
         terminated: bool,
     ) -> None:
         """Store one transition in place of the oldest one when the memory is full."""
-        row = self.n_added % self.capacity
-        arrays = self.arrays
-        arrays.observations[row] = observation
-        arrays.actions[row] = actions
-        arrays.rewards[row] = reward
-        arrays.next_observations[row] = next_observation
-        arrays.terminated[row] = terminated
+        transition = observation, actions, reward, next_observation, terminated
+        for array, value in zip(self.arrays, transition, strict=True):
+            array[self.n_added % self.capacity] = value
         self.n_added += 1
 
     def sample(self, batch_size: int, rng: np.random.Generator) -> Batch:

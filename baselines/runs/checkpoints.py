@@ -67,15 +67,7 @@ class Resumable(Saved, Protocol):
 
 
 class Checkpoints:
-    """The checkpoints of one run.
-
-    Parameters
-    ----------
-    run
-        The run folder.
-    config
-        What the run is, ready for JSON; a checkpoint of anything else is refused.
-    """
+    """The checkpoints in a run's folder; any of a run with another config (JSON) is refused."""
 
     def __init__(self, run: Path, config: Mapping[str, Any]) -> None:
         self.folder = run / CHECKPOINTS
@@ -195,10 +187,7 @@ def part(arrays: dict[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
 
 
 def take(arrays: dict[str, np.ndarray], name: str, like: np.ndarray) -> np.ndarray:
-    """Return a copy of one of the arrays, which must have the shape and type of another.
-
-    Raises a ValueError if it is not there, or is of another shape or type.
-    """
+    """Return a copy of an array; a ValueError unless it is there, of another's shape and type."""
     found = arrays.get(name)
     if found is None or found.shape != like.shape or found.dtype != like.dtype:
         got = "nothing" if found is None else f"{found.dtype} of shape {found.shape}"
@@ -245,10 +234,7 @@ def go_on(run: RunFolder, checkpoints: Checkpoints, training: Resumable) -> bool
 
 
 def check_restored(checkpoint: Checkpoint, training: Resumable) -> None:
-    """Compare what a training has taken over with what was saved.
-
-    Raises a ValueError if the next checkpoint would not hold the same.
-    """
+    """Raise a ValueError if a training's next checkpoint would not hold what was just restored."""
     state = {**training.state(), "metrics": checkpoint.state["metrics"]}
     saved = _entries(checkpoint)
     found = _entries(Checkpoint(training.number, training.arrays(), state))

@@ -52,23 +52,13 @@ MAX_HEADER_BYTES = 1024  # of metrics.csv
 
 
 class RunFolder:
-    """The folder of one training, locked while it is open.
+    """The folder of one training, with its metrics.csv open, locked until it is closed.
 
-    Parameters
-    ----------
-    folder
-        Where; it must not exist, or be empty, unless a run is resumed. (A training that was killed
-        before its config was written has left nothing.)
-    columns
-        The columns of metrics.csv.
-    resume
-        Whether to go on in a folder that a training has left.
+    It must not exist, or be empty, unless a run is resumed. (A training that was killed before its
+    config was written has left nothing.)
 
-    Raises
-    ------
-    ValueError
-        If the folder holds something already (or, to resume, no run), cannot be made, or another
-        training has it open.
+    Raises a ValueError if the folder holds something already (or, to resume, no run), cannot be
+    made, or another training has it open.
     """
 
     def __init__(self, folder: Path, columns: Sequence[str], resume: bool = False) -> None:
@@ -147,12 +137,7 @@ class RunFolder:
     def position(self) -> dict[str, Any]:
         """Force metrics.csv to the disk; return what is in it, for a checkpoint.
 
-        Raises
-        ------
-        ValueError
-            If there is another file in its place.
-        OSError
-            If there is none.
+        Raises a ValueError if there is another file in its place, an OSError if there is none.
         """
         path = self.path(METRICS_FILE)
         os.fsync(self._metrics.fileno())
