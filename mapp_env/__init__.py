@@ -76,7 +76,7 @@ _MEANT = {
     "central_env": 'gymnasium.make("mapp_env/Central-v0")',
     "vector_env": "mapp_env.make_vec(num_envs)",
 }
-"""What is easily called for an environment, and what makes one."""
+"""Names that are easily mistaken for environment constructors, and what to call instead."""
 
 
 class _Module(ModuleType):
@@ -92,7 +92,7 @@ for _name in _MEANT:
     if f"mapp_env.{_name}" in sys.modules:
         sys.modules[f"mapp_env.{_name}"].__class__ = _Module
 
-if not TYPE_CHECKING:  # for type checkers there would be no wrong name any more
+if not TYPE_CHECKING:  # type checkers would accept every attribute
 
     def __getattr__(name: str) -> Any:
         """Say where an environment is that is looked for at the top of the package."""

@@ -58,7 +58,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def nogil_kernel(function: Callable[..., Any]) -> Any:
-    """Compile and keep a function that allocates, while which other threads run on.
+    """Compile and keep a function that allocates, and that releases the GIL.
 
     Its files are named after it alone: it may call nothing that stands in another file.
     """

@@ -359,7 +359,7 @@ def pairs_of(grid: Grid, cells: NDArray[np.integer[Any]]) -> NDArray[np.integer[
 
 
 def tell_apart(grid: Grid, other: Grid) -> str:
-    """Return in words what makes a grid another than one that does not equal it."""
+    """Describe how two unequal grids differ."""
     if grid.walls.shape != other.walls.shape:
         return f"{grid.rows} x {grid.cols} cells, not {other.rows} x {other.cols}"
     if grid.depot != other.depot:

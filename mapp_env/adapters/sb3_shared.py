@@ -151,7 +151,7 @@ def make_sb3_shared(num_envs: int, **arguments: Any) -> SharedVecEnv:
         Number of environments, each with N agents: the ``VecEnv`` has ``num_envs * N`` rows.
     **arguments
         Those of :class:`mapp_env.envs.parallel_env.MappParallelEnv`, but that ``observation`` is
-        ``"own_first"`` if it is not given: with ``"global"`` all agents see, and so do, the same.
+        ``"own_first"`` if it is not given: with ``"global"`` all see the same, and act alike.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from mapp_env.grids import generator_names, grid_names, make_grid
 from mapp_env.problem import Problem, sample_problems
 from mapp_env.validation import check_count, describe
 
-MAX_DRAWN = 2**63 - 1  # of seeds
+MAX_DRAWN = 2**63 - 1  # largest seed of what is drawn
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
 GRID_OPTIONS = ("grid", "depot", "rows", "cols", "grid_seed")
 OPTIONS = ("problem", *GRID_OPTIONS, "landmarks", "n_landmarks", "n_agents")

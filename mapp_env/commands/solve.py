@@ -61,7 +61,8 @@ def run(arguments: argparse.Namespace) -> None:
     problem = problem_of(arguments)
     options = (arguments.objective, arguments.method, arguments.time_limit)
     plan = solve(problem, *options, seed_of(arguments))
-    record = plan.to_record()
+    # A plan longer than a file holds can still be printed and drawn.
+    record = plan.to_record() if arguments.json or arguments.out is not None else {}
     if draw is not None:
         draw(problem, plan)  # first, as more can stand in its way
     if arguments.out is not None:

@@ -30,12 +30,12 @@ def step_and_observe(
 ) -> tuple[float, bool, bool]:
     """Step a single row and observe it; parameters as in ``step_row`` and ``observe_row``.
 
-    Raises a ValueError if ``actions`` are not one an agent, each one that it has; nothing has moved
-    then. (The rules index a table with them, and what is no action would leave its memory.).
+    Raises a ValueError unless there is exactly one valid action per agent; nothing has moved then.
+    (The rules index a table with actions: an invalid one would read outside of it.)
     """
     own = World(*world)
     if actions.shape[0] != own.n_agents:
-        raise ValueError("actions must hold one action an agent")
+        raise ValueError("actions must hold one action per agent")
     for agent in range(own.n_agents):
         if not 0 <= actions[agent] < masks.shape[1]:
             raise ValueError("actions must be in 0..A-1, A the number of an agent's actions")

@@ -15,13 +15,13 @@ from mapp_env.engine.task import Task
 from mapp_env.problem import Problem
 
 FIRST_ROW = np.zeros(1, np.int64)
-VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # to make them of types takes longer
+VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # faster to pass than types
 
 
 class Simulation:
     """A single row, from reset to the end of its episode.
 
-    A step has V observations: ``n_views`` is the number of agents, or 1 for the global one once.
+    A step has V observations: ``n_views`` is the number of agents, or 1 to write the global one once.
     """
 
     def __init__(self, task: Task, n_views: int) -> None:

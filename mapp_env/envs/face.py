@@ -118,7 +118,7 @@ class SimulationEnv(Face, gymnasium.Env[Any, Any]):
             number is not None and 0 <= number <= highest for number in numbers
         ):
             raise ValueError(
-                f"action must hold {n_agents} integers in 0..{highest}, one an agent, "
+                f"action must hold {n_agents} integers in 0..{highest}, one per agent, "
                 f"got {describe(action)}"
             )
         return np.array(numbers, np.int64)

@@ -43,7 +43,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         When a finished row starts its next episode: ``NEXT_STEP`` (Gymnasium's default),
         ``SAME_STEP`` or ``DISABLED``, with infos where Gymnasium puts them.
     central_action : {"multi", "joint", "auto"}
-        Actions of shape (B, N), one an agent, or (B,), numbered joint actions.
+        Actions of shape (B, N), one per agent, or (B,), numbered joint actions.
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
         As in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
@@ -222,7 +222,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self._ended = terminations | truncations
         ended = np.flatnonzero(self._ended)
         restarted = mode == AutoresetMode.SAME_STEP
-        # Of few rows most steps have none, and to look for them takes longest.
+        # With few rows most steps end none, and looking for them takes longest.
         endings = self._no_endings
         if len(ended):
             last = observations.take(ended, axis=0), masks.take(ended, axis=0)

@@ -242,7 +242,7 @@ class Plan:
         problem, episode = self._verify(self.problem)
         if len(episode.actions) > MAX_CYCLES:
             raise FileError(f"plan: has {len(episode.actions)} steps, a file holds {MAX_CYCLES}")
-        # As played: what is equal but of another type, NumPy's integers say, is no JSON.
+        # As played: NumPy integers compare equal, but are not JSON.
         tours: Any = episode.tours
         if sum(map(len, tours)) > MAX_LISTED_CELLS:
             tours = [moves_of(problem.grid, tour) for tour in tours]

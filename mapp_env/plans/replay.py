@@ -34,7 +34,7 @@ def play_episode(problem: Problem, actions: NDArray[np.int64]) -> Episode:
     """Carry out joint actions, shape (T, N), until every landmark is visited or the step limit.
 
     The limit is the problem's, if it has one; actions are as :func:`check_joint_actions` says. The
-    last episode is kept: who checks, saves or draws a plan asks for the same once more.
+    last episode is kept: checking, saving and drawing a plan play the same actions.
     """
     return _play(problem, actions.tobytes())
 

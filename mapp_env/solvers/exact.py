@@ -28,7 +28,7 @@ from mapp_env.solvers.held_karp import Steps, route_tables, tours_within, trace_
 from mapp_env.solvers.solution import Solution, landmark_distances, solution_of, team_of
 
 MAX_EXACT_LANDMARKS = 20  # the table of routes takes 80 MiB then
-FEW_AGENTS = 5  # up to which a table an agent, of wanted sets only, is faster than one of all
+FEW_AGENTS = 5  # up to here, a table per agent of the sets it needs is faster than one of all sets
 
 
 def solve_exact(
@@ -87,7 +87,7 @@ def smallest_limit(costs: Steps, teams: int, low: int = 0) -> int:
 class Families:
     """The sets of landmarks that 1, 2, 3, ... agents can visit within a limit.
 
-    Whether N sets that one agent each can visit hold everything is decided by counting: the pairs
+    Whether N sets, one per agent, cover all landmarks is decided by counting: the pairs
     of sets whose union is a given set, for all sets at once, by zeta and Moebius transforms over
     the subset lattice (inclusion-exclusion, as in Bjorklund, Husfeldt and Koivisto 2009,
     doi:10.1137/070683933). Counts stay below 4**20, so whole 64-bit numbers are exact.
@@ -149,14 +149,14 @@ def sum_subsets(counts: NDArray[np.int64], sign: int) -> None:
 
 
 def _split(tours: Steps, families: Families, teams: int) -> list[int]:
-    """Return disjoint sets, one an agent, that hold everything with the least sum of tours.
+    """Return disjoint sets, one per agent, that cover all landmarks with the least sum of tours.
 
     ``tours``, shape (2 ** K,), is what each set costs one agent, at least ``FAR`` if it cannot
     visit it; ``teams`` agents can visit everything.
     """
     half = len(tours) // 2
     if teams > FEW_AGENTS:
-        # With no limit on the agents one table does, which fills itself in; mostly it needs few.
+        # Without a limit one table serves all agents; it is filled on demand.
         sums = np.empty(half, np.int32)
         add_agent(tours, sums, np.ones(half, np.bool_), sums)
         parts = _trace_parts(tours, [sums] * len(tours).bit_length())
@@ -175,7 +175,7 @@ def _split(tours: Steps, families: Families, teams: int) -> list[int]:
 
 
 def _trace_parts(tours: Steps, tables: Sequence[Steps]) -> list[int]:
-    """Return the disjoint sets, one an agent, whose sum is the least by tables of sums."""
+    """Return the disjoint sets, one per agent, whose sum is the least by tables of sums."""
     left = len(tours) - 1
     parts = []
     for sums in reversed(tables):

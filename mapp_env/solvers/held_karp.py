@@ -91,7 +91,7 @@ def trace_route(
 ) -> int:
     """Write the landmarks of a set's shortest closed tour within a limit; return how many.
 
-    Among equals the tour that is first on its last landmark, then the lowest landmarks, from the
+    Ties go to the tour that reaches its last landmark first, then to the lowest landmarks, from the
     end backwards.
     """
     n_landmarks = routes.shape[1]

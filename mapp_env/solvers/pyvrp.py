@@ -100,7 +100,7 @@ def solve_pyvrp(
 def _stop_at(
     deadline: float, cost: int, on_better: Callable[[int], None] | None
 ) -> Callable[[float], bool]:
-    """Return what tells PyVRP to stop: at a time, or at a cost (which is far above any no plan).
+    """Return what tells PyVRP to stop: at a time, or at a cost.
 
     PyVRP asks in each iteration, so this is also who sees costs fall.
     """
