@@ -166,6 +166,7 @@ class AgentLearner(QLearner):
     def update(self, progress: float) -> float:
         """One step of Adam down the Huber loss of a batch, at a part of the training (0 to 1)."""
         args = self.args
+        # Imagined batches are drawn one update early, by the target network as it was then.
         batch, targets = self.prepared or self.sample(progress)
         self.prepared = self.sample(progress) if self.ahead else None
 

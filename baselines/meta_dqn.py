@@ -105,7 +105,7 @@ class MetaLearner(QLearner):
         next_observation: np.ndarray,
         terminated: bool,
     ) -> None:
-        """Store a transition."""
+        """Store a transition (imagined replay keeps only where each agent's move led)."""
         self.replay.add(observation, actions, reward, next_observation, terminated)
 
     @property
@@ -147,6 +147,7 @@ class MetaLearner(QLearner):
     def update(self, progress: float) -> float:
         """One step of Adam down the Huber loss of a batch, at a part of the training (0 to 1)."""
         args = self.args
+        # Imagined batches are drawn one update early, by the target network as it was then.
         batch, targets = self.prepared or self.sample(progress)
         self.prepared = self.sample(progress) if self.ahead else None
 

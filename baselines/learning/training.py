@@ -24,7 +24,7 @@ METRICS = (
     *("episode", "problem", "steps", "reward", "solved", "epsilon", "guidance"),
     *("updates", "loss"),
 )
-DRAWN = ("network alone", "network, guidance 1")  # whose routes are
+POLICIES_WITH_ROUTES = ("network alone", "network, guidance 1")
 
 
 class Learner(Saved, Protocol):
@@ -222,7 +222,7 @@ class Training(Trainable):
         }
 
     def restore(self, arrays: dict[str, np.ndarray], state: dict[str, Any]) -> None:
-        """Take over what was saved; the episode so far is played again, as nothing is chance."""
+        """Take over what was saved; the episode so far is played again, as it is deterministic."""
         self.now = now = Progress(**state["progress"])
         self.rng.bit_generator.state = state["rng"]
         self.learner.restore(arrays, state["learner"])
@@ -241,7 +241,7 @@ class Training(Trainable):
         logged = len(table["episode"]), sum(table["steps"]), sum(table["updates"])
         if finished != logged:
             raise ValueError(
-                f"finished episodes, their steps and updates are {finished} by it, and {logged} by "
+                f"finished episodes, their steps and updates are {finished} in it, and {logged} in "
                 "metrics.csv"
             )
 
@@ -272,7 +272,9 @@ class Training(Trainable):
 
         draw_learning_curves(folder)
         if evaluations:
-            routes = {label: evaluations[label] for label in DRAWN if label in evaluations}
+            routes = {
+                label: evaluations[label] for label in POLICIES_WITH_ROUTES if label in evaluations
+            }
             draw_routes(folder, routes)
 
 

@@ -65,7 +65,12 @@ def spec_from_options(options: object, kind: str, grid: Grid, **changes: Any) ->
     Raises a ValueError if there is no such kind, or one of its fields is invalid.
     """
     check_choice("kind", kind, tuple(NETWORKS))
-    values = {**vars(options), "n_actions": 4, "n_cells": grid.n_cells, "grid": grid.to_text()}
+    values = {
+        **vars(options),
+        "n_actions": N_ACTIONS,
+        "n_cells": grid.n_cells,
+        "grid": grid.to_text(),
+    }
     values |= changes
     spec_type = NETWORKS[kind].spec_type
     return spec_type(**{f.name: values[f.name] for f in fields(spec_type) if f.name in values})

@@ -231,7 +231,7 @@ def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = N
     policy
         Who commands the agents.
     problems
-        Of any of the policy's grids, numbers of agents and of landmarks.
+        On grids, with numbers of agents and landmarks, that the policy takes.
     max_cycles
         Step limit of all of them. By default each problem's own or, if it has none, as many steps
         as one agent alone needs that walks from each landmark to the next.

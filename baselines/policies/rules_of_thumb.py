@@ -82,7 +82,7 @@ RULES = {
     "nearest": ("nearest landmark", NearestLandmarkPolicy),
     "earliest": ("earliest arrival", EarliestArrivalPolicy),
 }
-"""Rules without a network by what commands call them: how tables call them, and who they are."""
+"""Rules without a network: for each option value, the label in tables and the policy."""
 
 
 def rules_of_thumb(setting: Setting) -> dict[str, Acting]:

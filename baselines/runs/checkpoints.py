@@ -3,7 +3,7 @@
 A checkpoint is two files in the run's folder ``checkpoints``: ``<number>.safetensors`` holds the
 arrays, ``<number>.json`` everything else, and the digests of both. Each is written beside its
 place, forced to the disk and renamed; the JSON comes last, so that half a checkpoint never counts.
-The last two are kept; files that are no checkpoints are let be. Nothing is pickled, and no code is
+The last two are kept; other files are left alone. Nothing is pickled, and no code is
 run from a file. The first one is written before the first step: where metrics.csv has rows and
 there is none, they were deleted.
 """
@@ -240,7 +240,7 @@ def check_restored(checkpoint: Checkpoint, training: Resumable) -> None:
     found = _entries(Checkpoint(training.number, training.arrays(), state))
     differing = sorted(k for k in saved.keys() | found.keys() if saved.get(k) != found.get(k))
     if differing:
-        raise ValueError(f"it has not all of {', '.join(differing)}, or something else there")
+        raise ValueError(f"missing or different: {', '.join(differing)}")
 
 
 def _entries(checkpoint: Checkpoint) -> dict[str, object]:

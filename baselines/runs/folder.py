@@ -96,7 +96,7 @@ class RunFolder:
             self._opened = opened.pop_all()
 
     def _lock_metrics(self) -> None:
-        """Lock metrics.csv as well: of a lock file that was deleted others have another one."""
+        """Lock metrics.csv as well: a lock file that was deleted no longer keeps others out."""
         if fcntl is None:
             return
         try:

@@ -25,7 +25,7 @@ from mapp_env.problem import MAX_CYCLES
 class Rows:
     """The state of B problems of one task.
 
-    A row has V observations: ``n_views`` is the number of agents, or 1 to write the global one once.
+    A row has V observations: ``n_views`` is N, or 1 to write the global one once.
     ``array``, (B, L) int32, holds the rows, ``state`` names its parts.
     """
 

@@ -21,7 +21,7 @@ VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # faster to pass than ty
 class Simulation:
     """A single row, from reset to the end of its episode.
 
-    A step has V observations: ``n_views`` is the number of agents, or 1 to write the global one once.
+    A step has V observations: ``n_views`` is N, or 1 to write the global one once.
     """
 
     def __init__(self, task: Task, n_views: int) -> None:

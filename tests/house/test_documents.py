@@ -234,7 +234,7 @@ def test_each_logged_metric_is_explained() -> None:
     evaluation = importlib.import_module("baselines.policies.evaluation")
     setting = evaluation.Setting(importlib.import_module("mapp_env").make_grid())
     table = evaluation.evaluate(
-        importlib.import_module("baselines.policies.policy").NearestLandmarkPolicy(
+        importlib.import_module("baselines.policies.rules_of_thumb").NearestLandmarkPolicy(
             setting.grid, 3, 5
         ),
         setting,
