@@ -30,7 +30,8 @@ Paper: M. Cetinkaya, Multi-Agent Path Planning Using Deep Reinforcement Learning
 
 The algorithm stands in :class:`AgentLearner`, step by step as the meta-agent's in ``meta_dqn.py``.
 What differs is what an agent is told, ``remember`` of :class:`IndependentLearners`, and what it
-can learn from that, the replay in ``sample``.
+can learn from that: the replay in ``sample``, where values are bounded by 0, as nothing else bounds
+them, and those of imagined states are computed anew for each batch.
 
 Command::
 

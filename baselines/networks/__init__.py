@@ -19,6 +19,7 @@ from baselines.networks.pairs import PairsNetwork
 from baselines.networks.paper import PaperNetwork
 from baselines.networks.team import Team, view
 from mapp_env import Grid
+from mapp_env.engine.state import N_ACTIONS
 from mapp_env.validation import check_choice
 
 __all__ = [
@@ -65,12 +66,8 @@ def spec_from_options(options: object, kind: str, grid: Grid, **changes: Any) ->
     Raises a ValueError if there is no such kind, or one of its fields is invalid.
     """
     check_choice("kind", kind, tuple(NETWORKS))
-    values = {
-        **vars(options),
-        "n_actions": N_ACTIONS,
-        "n_cells": grid.n_cells,
-        "grid": grid.to_text(),
-    }
+    sizes = {"n_actions": N_ACTIONS, "n_cells": grid.n_cells}
+    values = {**vars(options), **sizes, "grid": grid.to_text()}
     values |= changes
     spec_type = NETWORKS[kind].spec_type
     return spec_type(**{f.name: values[f.name] for f in fields(spec_type) if f.name in values})
