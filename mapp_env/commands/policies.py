@@ -106,8 +106,8 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
         grid = getattr(policy, "grid", None)  # one that names none plays on any
     if isinstance(grid, Grid) and grid != problem.grid:
         raise ValueError(
-            "--policy cannot play this problem: it must be for this grid, or for any, and was "
-            f"trained on another; here {tell_apart(problem.grid, grid)}"
+            "--policy cannot play this problem: it must be for this grid, or for any, and is for "
+            f"another grid; here {tell_apart(problem.grid, grid)}"
         )
     env = CentralEnv(
         problem.grid, problem.n_agents, len(problem.landmarks), max_cycles, central_action="multi"
