@@ -228,7 +228,8 @@ def test_long_commands_are_understood(command: str, monkeypatch: pytest.MonkeyPa
     elif words[:3] == ["python", "-m", "pytest"] or words[1:4] == ["python", "-m", "pytest"]:
         for word in words[words.index("pytest") + 1 :]:
             known = (
-                word in ("-n", "2", "-k", "rounded", "-m", "slow") or (REPOSITORY / word).exists()
+                word in ("-n", "2", "-k", "large", "rounded", "-m", "slow")
+                or (REPOSITORY / word).exists()
             )
             assert known, f"{command}: {word}"
     elif words[0] == "grep" or any(word.startswith(".venv-") for word in words[:2]):
