@@ -167,9 +167,9 @@ class AgentLearner(QLearner):
     def update(self, progress: float) -> float:
         """One step of Adam down the Huber loss of a batch, at a part of the training (0 to 1)."""
         args = self.args
-        # Imagined batches are drawn one update early, by the target network as it was then.
+        # Imagined batches are drawn one update early, beside the step below.
         batch, targets = self.prepared or self.sample(progress)
-        self.prepared = self.sample(progress) if self.ahead else None
+        coming = self.draw_ahead(progress)
 
         obs, actions = map(torch.from_numpy, (batch.observations, batch.actions))
         loss = smooth_l1_loss(
@@ -180,6 +180,7 @@ class AgentLearner(QLearner):
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
 
+        self.prepared = coming()  # before the target network moves, which it reads
         self.updates += 1
         move_target(self.target, self.network, args, self.updates)
         return loss.item()

@@ -100,7 +100,9 @@ def search_space(states: int) -> dict[str, Any]:
 def make_options(config: dict[str, Any], states: int, seed: int) -> Options:
     """Return the preset's options with a trial's settings."""
     batch_size = states // config["updates_per_episode"]
-    return preset_options(Options, "default", seed=seed, batch_size=batch_size, **config)
+    return preset_options(
+        Options, "default", seed=seed, prefetch=False, batch_size=batch_size, **config
+    )
 
 
 def preset_point(space: dict[str, Any], states: int) -> dict[str, Any]:

@@ -190,6 +190,9 @@ class Options(RunOptions):
     guidance_reach: Annotated[int, Within(1, 512)] = 3
     """most moves, in a straight line without walls, at which a landmark counts as close"""
 
+    prefetch: bool = True
+    """whether the next batch is drawn in a second thread; the weights are the same"""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.updates_per_episode == self.update_interval == 0:

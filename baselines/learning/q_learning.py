@@ -5,6 +5,7 @@ acts, stores, samples and learns stands in its script: ``meta_dqn.py``, ``indepe
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -178,6 +179,7 @@ class QLearner:
         self.goals = make_goals(args, grid)
         self.updates = 0
         self.prepared: tuple[Batch, Tensor] | None = None  # the next batch and its targets
+        self.helper = ThreadPoolExecutor(1) if self.ahead and args.prefetch else None
 
     def goal(self, progress: float) -> Goal:
         """Return what is aimed at when a part of the training (0 to 1) is over."""
@@ -192,6 +194,23 @@ class QLearner:
         it is when it learns.
         """
         return self.args.replay != "stored" and not self.args.double
+
+    def draw_ahead(self, progress: float) -> Callable[[], tuple[Batch, Tensor] | None]:
+        """Begin to draw the next batch, if it is drawn ahead; return what waits for it.
+
+        Drawing reads the target network and the replay, and a step of the optimiser neither: with
+        or without a second thread the weights are the same.
+        """
+        if not self.ahead:
+            return lambda: None
+        if self.helper is not None:
+            return self.helper.submit(self.sample, progress).result
+        drawn = self.sample(progress)
+        return lambda: drawn
+
+    def sample(self, progress: float) -> tuple[Batch, Tensor]:
+        """Draw a batch, and compute the targets of its values."""
+        raise NotImplementedError
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all arrays that change, by name."""

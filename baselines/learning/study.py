@@ -43,7 +43,7 @@ from baselines.runs.folder import (
 from baselines.runs.stop import StopSignals
 
 # What a study sets for each run itself.
-OWN_OPTIONS = ("out", "resume", "seed", "preset", "share_parameters", "threads")
+OWN_OPTIONS = ("out", "resume", "seed", "preset", "share_parameters", "threads", "prefetch")
 
 
 # -- one run -----------------------------------------------------------------------------------
@@ -159,7 +159,8 @@ def plan_run(
     for word in words:
         if word.startswith("--") and option_name(word) in set_here:
             raise ValueError(f"{word}: set for each training by the study itself")
-    all_words = ("--seed", str(seed), *own, *words)
+    # With a process for each core a second thread gains nothing.
+    all_words = ("--seed", str(seed), "--no-prefetch", *own, *words)
     options = parse_options(script.Args, "", all_words)
     if not options.evaluation_problems:
         raise ValueError("evaluation_problems must be at least 1 to compare, got 0")

@@ -35,6 +35,7 @@ SHORT = {
     "code_units": 8,
     "evaluation_problems": 0,
     "checkpoint_seconds": 0.0,
+    "prefetch": False,  # no threads in a process that is forked
 }
 PRESETS = {
     "default": {"updates_per_episode": 6, "max_cycles": 20},
@@ -253,6 +254,14 @@ def test_a_training_where_folders_cannot_be_synced(whole, tmp_path, monkeypatch)
     monkeypatch.setattr(os, "fsync", of_files)
     assert run(options("paper", out=tmp_path / "run")) == 0
     assert results(tmp_path / "run") == whole("paper")[0]
+
+
+@pytest.mark.parametrize("kind", ["default", "independent"])
+def test_without_a_second_thread_the_same(kind, tmp_path):
+    """Drawing batches ahead in a second thread changes no byte."""
+    run(options(kind, out=tmp_path / "one"))
+    run(options(kind, out=tmp_path / "two", prefetch=True))
+    assert results(tmp_path / "one") == results(tmp_path / "two")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
