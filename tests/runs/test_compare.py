@@ -46,7 +46,7 @@ def compared(tmp_path_factory):
     """Return the folder of a tiny comparison, one of whose runs had been stopped half-way."""
     out = tmp_path_factory.mktemp("compared")
     stopped = out / "paper-shared-seed1"
-    words = ["--preset", "paper", "--seed", "1", "--share-parameters", *WORDS]
+    words = ["--preset", "paper", "--seed", "1", "--share-parameters", "--no-prefetch", *WORDS]
     options = parse_options(independent_dqn.Args, "", [*words, "--out", str(stopped)])
     advance, calls = Training.advance, []
 
@@ -88,7 +88,7 @@ def test_stopped_run_is_resumed(compared, tmp_path):
     log = (compared / "paper-shared-seed1.log").read_text()
     assert "going on from episode" in log
     assert "going on" not in (compared / "paper-shared-seed0.log").read_text()
-    words = ["--preset", "paper", "--seed", "1", "--share-parameters", *WORDS]
+    words = ["--preset", "paper", "--seed", "1", "--share-parameters", "--no-prefetch", *WORDS]
     whole = parse_options(independent_dqn.Args, "", [*words, "--out", str(tmp_path / "whole")])
     assert independent_dqn.main(whole) == 0
     for name in ("metrics.csv", "policy.safetensors", "evaluation.csv"):
