@@ -107,6 +107,18 @@ def test_each_thing_is_done_once(
     assert mapp_env.Plan.load("plan.json").cost == 12
 
 
+def test_a_plan_too_long_for_a_file_is_printed(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What no file holds is printed all the same, and refused where a file or JSON is asked for."""
+    monkeypatch.setattr("mapp_env.plans.plan.MAX_CYCLES", 5)  # in place of a million steps
+    assert "cover time 12" in printed(capsys, "solve", "--landmarks", *CELLS)
+    for words in (("--json",), ("--out", "plan.json")):
+        assert main(["solve", "--landmarks", *CELLS, *words]) == 2
+        assert "12 steps, a file holds 5" in capsys.readouterr().err
+    assert not (folder / "plan.json").exists()
+
+
 def test_a_problem_file_is_a_problem(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A saved problem, with agents and a grid of its own, is solved and drawn as it is."""
     grid = mapp_env.make_grid("rooms", rows=9, cols=11, seed=1)
