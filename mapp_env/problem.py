@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -29,7 +29,7 @@ LOW_32_BITS = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Problem:
-    """What is to be solved: visit every landmark with a team that starts on the depot.
+    """What is to be solved: a team visits every landmark of a grid.
 
     Parameters
     ----------
@@ -42,6 +42,14 @@ class Problem:
         1 to 16.
     max_cycles : int, optional
         Step limit of an episode on this problem; without it, the environment's own.
+    starts : sequence of int or of (int, int), optional
+        Where each agent stands at first: cells reachable from the depot, or the depot itself, none
+        of them a landmark; several agents may share one. Without it all start on the depot.
+
+    Attributes
+    ----------
+    start_cells : tuple of int
+        Each agent's first cell, whether ``starts`` was given or not.
 
     Raises
     ------
@@ -53,6 +61,9 @@ class Problem:
     landmarks: tuple[int, ...]
     n_agents: int = 3
     max_cycles: int | None = None
+    # Not compared: that all start on the depot may be said or left out.
+    starts: tuple[int, ...] | None = field(default=None, compare=False)
+    start_cells: tuple[int, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         check_grid("grid", self.grid)
@@ -61,6 +72,11 @@ class Problem:
         if self.max_cycles is not None:
             limit = check_count("max_cycles", self.max_cycles, 1, MAX_CYCLES)
             object.__setattr__(self, "max_cycles", limit)
+        cells = (self.grid.depot,) * self.n_agents
+        if self.starts is not None:
+            cells = check_starts(self.grid, self.starts, self.n_agents, self.landmarks)
+            object.__setattr__(self, "starts", cells)
+        object.__setattr__(self, "start_cells", cells)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the problem as JSON, grid included, whole or not at all.
@@ -95,6 +111,7 @@ class Problem:
             "landmarks": self.landmarks,
             "n_agents": self.n_agents,
             "max_cycles": self.max_cycles,
+            "starts": self.starts,
         }
 
     @classmethod
@@ -110,9 +127,10 @@ class Problem:
         landmarks = record.cells("landmarks")
         n_agents = record.number("n_agents")
         max_cycles = record.number("max_cycles", null=None)
+        starts = None if record.version < 2 else record.cells("starts", null=None)
         record.finish()
         try:
-            return cls(Grid.from_text(text), landmarks, n_agents, max_cycles)
+            return cls(Grid.from_text(text), landmarks, n_agents, max_cycles, starts)
         except ValueError as error:
             raise FileError(f"{record.where}: {error}") from error
 
@@ -139,31 +157,60 @@ def check_landmarks(
     Raises a ValueError if the number is wrong, or a cell is off the grid, a wall, the depot,
     unreachable or named twice.
     """
-    given = landmarks
-    if isinstance(landmarks, np.ndarray):
-        landmarks = list(landmarks) if landmarks.ndim > 0 else None
-    if not isinstance(landmarks, Sequence) or isinstance(landmarks, str | bytes):
-        raise ValueError(
-            f"{name} must be a sequence of cells or of (row, col) pairs, got {describe(given)}"
-        )
     low, high = (1, MAX_LANDMARKS) if count is None else (count, count)
-    if not low <= len(landmarks) <= high:
-        allowed = f"1..{MAX_LANDMARKS}" if count is None else str(count)
-        raise ValueError(f"{name} must hold {allowed} cells, got {describe(given)}")
     cells: list[int] = []
-    for index, value in enumerate(landmarks):
+    for index, value in enumerate(_check_list(landmarks, low, high, name)):
         label = f"{name}[{index}]"
-        cell = grid.cell(label, value)
-        if grid.walls.flat[cell]:
-            raise ValueError(f"{label} must be a free cell, got {describe(value)}, a wall")
+        cell = _check_cell(grid, value, label)
         if cell == grid.depot:
             raise ValueError(f"{label} must not be the depot, got {describe(value)}")
-        if grid.home[cell] < 0:
-            raise ValueError(f"{label} must be reachable from the depot, got {describe(value)}")
         if cell in cells:
             raise ValueError(f"{label} must differ from the others, got {describe(value)} twice")
         cells.append(cell)
     return tuple(cells)
+
+
+def check_starts(
+    grid: Grid, starts: object, n_agents: int, landmarks: Sequence[int], name: str = "starts"
+) -> tuple[int, ...]:
+    """Return ``starts``, cells or their rows and columns, as cells where agents may begin.
+
+    Raises a ValueError if there is not one for each agent, or one is off the grid, a wall,
+    unreachable from the depot or a landmark.
+    """
+    cells: list[int] = []
+    for index, value in enumerate(_check_list(starts, n_agents, n_agents, name)):
+        label = f"{name}[{index}]"
+        cell = _check_cell(grid, value, label)
+        if cell in landmarks:
+            raise ValueError(f"{label} must not be a landmark, got {describe(value)}")
+        cells.append(cell)
+    return tuple(cells)
+
+
+def _check_list(value: object, low: int, high: int, name: str) -> Sequence[object]:
+    """Return ``value`` if it is a sequence of so many items."""
+    given = value
+    if isinstance(value, np.ndarray):
+        value = list(value) if value.ndim > 0 else None
+    if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+        raise ValueError(
+            f"{name} must be a sequence of cells or of (row, col) pairs, got {describe(given)}"
+        )
+    if not low <= len(value) <= high:
+        allowed = str(low) if low == high else f"{low}..{high}"
+        raise ValueError(f"{name} must hold {allowed} cells, got {describe(given)}")
+    return value
+
+
+def _check_cell(grid: Grid, value: object, name: str) -> int:
+    """Return the cell meant by ``value`` if an agent can stand there."""
+    cell = grid.cell(name, value)
+    if grid.walls.flat[cell]:
+        raise ValueError(f"{name} must be a free cell, got {describe(value)}, a wall")
+    if grid.home[cell] < 0:
+        raise ValueError(f"{name} must be reachable from the depot, got {describe(value)}")
+    return cell
 
 
 def sample_problems(

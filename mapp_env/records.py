@@ -14,7 +14,8 @@ from typing import Any
 from mapp_env.files import FileError, read_json, write_text
 from mapp_env.validation import describe
 
-VERSION = 1
+VERSION = 2
+"""Of the files that are written; those of version 1, without a problem's starts, are read, too."""
 
 MAX_PROBLEM_BYTES = 1 << 20
 """Largest problem file: the text of a 512 x 512 grid takes about a quarter of it."""
@@ -33,11 +34,13 @@ MAX_INTEGER = 2**53 - 1  # what every reader of JSON keeps exactly
 class Record:
     """An object of a file, of which each field is taken once.
 
-    ``where`` is how messages call it: the path, and the field it stands in.
+    ``where`` is how messages call it: the path, and the field it stands in; ``version`` is the
+    file's.
     """
 
-    def __init__(self, where: str, fields: dict[str, Any]) -> None:
+    def __init__(self, where: str, fields: dict[str, Any], version: int = VERSION) -> None:
         self.where = where
+        self.version = version
         self._left = fields
 
     def take(self, name: str) -> Any:
@@ -56,7 +59,7 @@ class Record:
         value = self.take(name)
         if type(value) is not dict:
             raise self.error(name, "must be an object", value)
-        return Record(f"{self.where}: field {name!r}", value)
+        return Record(f"{self.where}: field {name!r}", value, self.version)
 
     def number(self, name: str, null: Any = ...) -> Any:
         """Return a field that is a whole number from 0, or ``null`` for a null, if given."""
@@ -89,9 +92,15 @@ class Record:
             raise self.error(name, f"must be one of {', '.join(options)}", value)
         return value
 
-    def cells(self, name: str) -> tuple[int, ...]:
-        """Return a field that is a list of whole numbers from 0."""
-        return self._cells(name, self.take(name))
+    def cells(self, name: str, null: Any = ...) -> Any:
+        """Return a field that is a list of whole numbers from 0, or ``null`` for a null, if given.
+
+        The list is returned as a tuple.
+        """
+        value = self.take(name)
+        if value is None and null is not ...:
+            return null
+        return self._cells(name, value)
 
     def cell_lists(self, name: str, count: int) -> tuple[tuple[int, ...], ...]:
         """Return a field that is a list of ``count`` lists of whole numbers from 0."""
@@ -152,8 +161,9 @@ def read_record(path: str | os.PathLike[str], kind: str, limit: int) -> Record:
     record = Record(where, value)
     record.choice("format", [f"mapp_env {kind}"])
     version = record.number("version")
-    if version != VERSION:
-        raise record.error("version", f"must be {VERSION}", version)
+    if not 1 <= version <= VERSION:
+        raise record.error("version", f"must be in 1..{VERSION}", version)
+    record.version = version
     return record
 
 

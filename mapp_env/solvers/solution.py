@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,25 @@ def team_of(objective: str, n_agents: int, n_landmarks: int) -> tuple[int, bool]
     """
     teams = 1 if objective == "total_distance" else min(n_agents, n_landmarks)
     return teams, objective != "cover_time"
+
+
+class Distances(NamedTuple):
+    """Steps of shortest paths in a problem: node 0 is the depot, node k + 1 landmark k."""
+
+    between: NDArray[np.int32]  # (K + 1, K + 1), symmetric
+    starts: NDArray[np.int32]  # (N, K + 1), from where each agent starts
+
+
+def problem_distances(problem: Problem) -> Distances:
+    """Return the distances of a problem, its agents starting anywhere."""
+    between = landmark_distances(problem)
+    field = {}
+    for cell in set(problem.start_cells) - {problem.grid.depot}:
+        steps = problem.grid.distances_from([cell])[0]
+        field[cell] = steps[[problem.grid.depot, *problem.landmarks]]
+    return Distances(
+        between, np.array([field.get(cell, between[0]) for cell in problem.start_cells], np.int32)
+    )
 
 
 def landmark_distances(problem: Problem) -> NDArray[np.int32]:

@@ -81,7 +81,7 @@ def test_files_are_plain_json(tmp_path: Path) -> None:
     fields = json.loads((tmp_path / "plan.json").read_text("ascii"))
     assert fields["problem"]["grid"] == PROBLEM.grid.to_text()
     assert fields["cover_time"] is None
-    assert (fields["format"], fields["version"]) == ("mapp_env plan", 1)
+    assert (fields["format"], fields["version"]) == ("mapp_env plan", 2)
 
 
 def test_the_largest_grid_fits(tmp_path: Path) -> None:
@@ -346,7 +346,7 @@ HOSTILE: dict[str, bytes] = {
     "comment": b'{"format": "mapp_env plan" /* 1 */}',
     "other kind": b'{"format": "mapp_env tour", "version": 1}',
     "no version": b'{"format": "mapp_env plan"}',
-    "later version": b'{"format": "mapp_env plan", "version": 2}',
+    "later version": b'{"format": "mapp_env plan", "version": 3}',
     "lone surrogate": b'{"format": "\\ud800"}',
 }
 
