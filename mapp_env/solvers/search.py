@@ -211,7 +211,7 @@ def lay_out(
 
 @kernel
 def _equal(line: NDArray[np.int32], other: NDArray[np.int32]) -> bool:
-    for place in range(line.shape[0]):
-        if line[place] != other[place]:
-            return False
-    return True
+    place = 0
+    while place < line.shape[0] and line[place] == other[place]:
+        place += 1
+    return place == line.shape[0]
