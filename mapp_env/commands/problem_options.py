@@ -98,14 +98,14 @@ def problem_of(arguments: argparse.Namespace) -> Problem:
 def _draw(grid: Grid, count: int, seed: int, starts: Sequence[object] | None) -> list[int]:
     """Return drawn landmarks, none of them a start; raise ValueError if there is no room."""
     if starts is None:
-        return sample_problems(grid, 1, n_landmarks=count, seed=seed)[0].tolist()
+        return list(map(int, sample_problems(grid, 1, n_landmarks=count, seed=seed)[0]))
     taken = [grid.cell(f"starts[{index}]", cell) for index, cell in enumerate(starts)]
     candidates = np.setdiff1d(grid.reachable, np.array(taken, np.int32))
     count = check_count("--n-landmarks", count, 1, min(len(candidates), MAX_LANDMARKS))
     landmarks = np.empty(count, np.int32)
     word = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
     draw_landmarks(word, candidates, landmarks)
-    return landmarks.tolist()
+    return list(map(int, landmarks))
 
 
 def seed_of(arguments: argparse.Namespace) -> int:

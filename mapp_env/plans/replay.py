@@ -99,7 +99,7 @@ def play_row(
     own = World(*world)
     state = split_row(row, own.n_agents, own.n_landmarks)
     reset_row(row, landmarks, cells[0], own)
-    steps = actions.shape[0]
+    steps: int = actions.shape[0]
     for step in range(1, steps + 1):
         _, terminated, _ = step_row(row, actions[step - 1], steps, own)
         for agent in range(own.n_agents):

@@ -79,7 +79,8 @@ def moves_of(grid: Grid, tour: Sequence[int]) -> str:
     """Return the moves of a tour, a digit each: 0 left, 1 right, 2 up, 3 down."""
     cells = np.array(tour, np.int64)
     moves = (grid.moves[cells[:-1]] == cells[1:, None]).argmax(axis=1)
-    return (moves + ord("0")).astype(np.uint8).tobytes().decode("ascii")
+    letters: bytes = (moves + ord("0")).astype(np.uint8).tobytes()
+    return letters.decode("ascii")
 
 
 def tour_of(grid: Grid, start: int, moves: str) -> tuple[int, ...]:

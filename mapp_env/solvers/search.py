@@ -65,12 +65,7 @@ def solve_search(
     start = clock()
     deadline = math.inf if time_limit is None else start + time_limit
     distances = problem_distances(problem)
-    if bound is not None:
-        low = bound(distances)
-    elif distances.starts[:, 0].any():
-        low = 0  # TODO merge
-    else:
-        low = lower_bound(problem, objective, distances.between)
+    low = lower_bound(problem, objective, distances) if bound is None else bound(distances)
     search = Search(distances.between, problem.n_agents, objective, seed, distances.starts)
     best = UNBOUNDED
     chunk = 1
@@ -214,4 +209,4 @@ def _equal(line: NDArray[np.int32], other: NDArray[np.int32]) -> bool:
     place = 0
     while place < line.shape[0] and line[place] == other[place]:
         place += 1
-    return place == line.shape[0]
+    return bool(place == line.shape[0])
