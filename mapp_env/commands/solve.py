@@ -8,7 +8,7 @@ For example:
   a map of one's own, landmarks by row and column
     python -m mapp_env solve --grid office.map --landmarks 3,4 10,2 --n-agents 2
   agents in the middle of an episode: where each stands, and the landmarks that are left
-    python -m mapp_env solve --starts 27 5,1 --landmarks 0 6 48
+    python -m mapp_env solve --starts 27 5,2 --landmarks 0 6 48
   sixty landmarks of a warehouse, with a second to search
     python -m mapp_env solve --grid warehouse --n-landmarks 60 --time-limit 1
 """
