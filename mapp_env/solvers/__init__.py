@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from mapp_env.compiled import clock
-from mapp_env.plans.plan import OBJECTIVES, Plan, replay
+from mapp_env.plans.plan import OBJECTIVES, Plan
+from mapp_env.plans.replay import play_episode
 from mapp_env.plans.tours import walk_routes
 from mapp_env.problem import Problem
 from mapp_env.solvers.batch import optimal_costs, solve_universe
@@ -161,8 +163,7 @@ def _solve(
     solver = _solver(method)
     start = clock()
     solution = solver(problem, objective, time_limit=limit, seed=seed, **options)
-    plan = _plan_of(problem, objective, solution)
-    return replace(plan, solver=method, seconds=clock() - start)
+    return _plan_of(problem, objective, solution, method, start)
 
 
 def _solver(method: str) -> Solver:
@@ -178,19 +179,36 @@ def _solver(method: str) -> Solver:
     return solve_exact
 
 
-def _plan_of(problem: Problem, objective: str, solution: Solution) -> Plan:
-    """Return what the rules make of a solver's routes, if that is what the solver claims."""
+def _plan_of(
+    problem: Problem,
+    objective: str,
+    solution: Solution,
+    method: str = "replay",
+    start: float = math.inf,
+) -> Plan:
+    """Return what the rules make of a solver's routes, if that is what the solver claims.
+
+    ``start`` is when the ``method`` began, by the clock.
+    """
     routes = _idle_last(problem, solution.routes)
     endless = problem if problem.max_cycles is None else replace(problem, max_cycles=None)
-    plan = replay(endless, walk_routes(problem, routes), objective)
-    claimed = plan.cost == solution.bound if solution.optimal else plan.cost >= solution.bound
-    if not plan.success or not claimed:
+    episode = play_episode(endless, walk_routes(problem, routes))
+    cost = getattr(episode, objective)
+    claimed = cost == solution.bound if solution.optimal else cost >= solution.bound
+    if cost == math.inf or not claimed:
         raise RuntimeError(
             f"a solver claims the bound {solution.bound} (optimal={solution.optimal}), but its "
-            f"routes cost {plan.cost}: please report {problem!r}, objective {objective!r}"
+            f"routes cost {cost}: please report {problem!r}, objective {objective!r}"
         )
-    status = "optimal" if plan.cost == solution.bound else "feasible"
-    return replace(plan, problem=problem, status=status, bound=solution.bound)
+    return Plan(
+        **episode._asdict(),
+        objective=objective,
+        status="optimal" if cost == solution.bound else "feasible",
+        solver=method,
+        seconds=max(0.0, clock() - start),
+        bound=solution.bound,
+        problem=problem,
+    )
 
 
 def _idle_last(problem: Problem, routes: Routes) -> Routes:
@@ -198,9 +216,10 @@ def _idle_last(problem: Problem, routes: Routes) -> Routes:
 
     Such agents are exchangeable, and who comes later may follow: see ``walk_tours``.
     """
-    order = sorted(range(len(routes)), key=lambda agent: not routes[agent])
-    left = {
-        cell: [n for n in order if problem.start_cells[n] == cell]
-        for cell in set(problem.start_cells)
-    }
-    return tuple(routes[left[cell].pop(0)] for cell in problem.start_cells)
+    if all(routes):
+        return routes
+    left: dict[int, list[tuple[int, ...]]] = {}
+    for cell, route in zip(problem.start_cells, routes, strict=True):
+        left.setdefault(cell, []).append(route)
+    ordered = {cell: iter(sorted(line, key=lambda route: not route)) for cell, line in left.items()}
+    return tuple(next(ordered[cell]) for cell in problem.start_cells)
