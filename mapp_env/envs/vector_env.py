@@ -18,7 +18,7 @@ from mapp_env.engine.observation import Observation
 from mapp_env.engine.options import check_options, check_problems, check_reset_mask
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
-from mapp_env.engine.sources import OWN_LIMIT, Source
+from mapp_env.engine.sources import NO_GRIDS, OWN_LIMIT, Source
 from mapp_env.engine.task import Task
 from mapp_env.envs.arguments import BATCH_RENDER_MODES, AutoresetMode, BatchTask, takes
 from mapp_env.envs.central_env import CentralEnv, central_action_space
@@ -155,7 +155,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if asked.problems is not None:
             self._rows.start(indices, asked.problems.take(indices))
         else:
-            self._draw(indices, None if asked.grids is None else asked.grids[indices])
+            self._draw(indices, asked.grids[indices] if len(asked.grids) else NO_GRIDS)
         self._ended[indices] = False
         self._started = True
         views, action_mask = self._rows.observe()
@@ -164,7 +164,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if self._n_joint_actions:
             add_joint_masks(infos, self._n_joint_actions)
         if self.task.is_pool:
-            infos["grid"], infos["_grid"] = np.where(mask, self._grids(), 0), mask.copy()
+            infos["grid"], infos["_grid"] = np.where(mask, self._rows.grids, 0), mask.copy()
         return views.reshape(self._observations_shape), infos
 
     def step(
@@ -230,7 +230,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         restarted = mode == AutoresetMode.SAME_STEP
         # With few rows most steps end none, and looking for them takes longest.
         endings = self._no_endings
-        grids = self._grids() if self.task.is_pool else None
+        grids = self._rows.grids if self.task.is_pool else None
         if len(ended):
             last = observations.take(ended, axis=0), masks.take(ended, axis=0)
             endings = (self._rows.measure(ended), *last)
@@ -238,12 +238,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 self._draw(ended)
                 self._rows.observe_again(ended, views, masks)
         found = observations, rewards, terminations, truncations, masks, self._ended.copy(), ended
-        played = grids, self._grids() if restarted and self.task.is_pool else grids
+        played = grids, self._rows.grids if restarted and self.task.is_pool else grids
         return Transition(*found, *endings, restarted, *played)
-
-    def _grids(self) -> NDArray[np.int64]:
-        """Return the number of each row's grid, shape (B,)."""
-        return self._rows.state.grid[:, 0].astype(np.int64)
 
     def find_problem(self, options: Mapping[str, Any]) -> Problem | None:
         """Return the problem that options of a single environment fix, or ``None``.
@@ -265,7 +261,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             tuple(problems.cells[0].tolist()),
         )
 
-    def _draw(self, indices: NDArray[np.int64], grids: NDArray[np.int64] | None = None) -> None:
+    def _draw(self, indices: NDArray[np.int64], grids: NDArray[np.int64] = NO_GRIDS) -> None:
         """Start an episode on a random problem in some rows, (M,), on given grids or any."""
         self._rows.start(indices, self._source.draw(self._seeds.next_words(indices), grids))
 

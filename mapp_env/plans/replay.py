@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.rules import measure_row, reset_row, step_row
-from mapp_env.engine.state import Packed, World, new_rows, split_row
+from mapp_env.engine.state import Packed, new_rows, pack, split_row, unpack
 from mapp_env.engine.world import make_world
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
@@ -50,7 +50,7 @@ def _play(problem: Problem, data: bytes) -> Episode:
     cells[0] = problem.start_cells
     reset_row(row, np.array(problem.landmarks, np.int32), cells[0], world)
     visits = np.zeros(n_landmarks, np.int64)
-    steps = play_row(row, actions, cells, visits, tuple(world))
+    steps = play_row(row, actions, cells, visits, pack(world))
     claims: list[list[int]] = [[] for _ in range(n_agents)]
     claim_steps: list[list[int]] = [[] for _ in range(n_agents)]
     for landmark in np.argsort(visits, kind="stable"):
@@ -92,7 +92,7 @@ def play_row(
     Written are where the agents are after each step, ``cells`` (T + 1, N), and the step at which
     each landmark is visited, ``visits`` (K,), zero on entry.
     """
-    own = World(*world)
+    own = unpack(world)
     state = split_row(row, own.n_agents, own.n_landmarks)
     for step in range(1, actions.shape[0] + 1):
         _, terminated, _ = step_row(row, actions[step - 1], actions.shape[0], own)
