@@ -20,7 +20,14 @@ import numpy as np
 from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
+from mapp_env.solvers.solution import (
+    UNBOUNDED,
+    Routes,
+    Solution,
+    landmark_distances,
+    problem_distances,
+    solution_of,
+)
 
 DEFAULT_SECONDS = 2.0  # if there is no time limit
 
@@ -48,7 +55,7 @@ def solve_pyvrp(
     pyvrp = import_pyvrp()
     deadline = clock() + (DEFAULT_SECONDS if time_limit is None else time_limit)
     distances = landmark_distances(problem)
-    bound = lower_bound(problem, objective, distances)
+    bound = lower_bound(problem, objective, problem_distances(problem))
     total = objective == "total_distance"
     arcs = distances.astype(np.int64)
     if objective == "cover_time":

@@ -17,7 +17,14 @@ from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.ruin_recreate import BEST, DONE, Layout, Scratch, Team, improve
-from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
+from mapp_env.solvers.solution import (
+    UNBOUNDED,
+    Routes,
+    Solution,
+    landmark_distances,
+    problem_distances,
+    solution_of,
+)
 from mapp_env.validation import check_count
 
 DEFAULT_ITERATIONS = 200_000  # without a time limit: well under a second for 50 landmarks
@@ -54,7 +61,7 @@ def solve_search(
     check_count("iterations", iterations, 1, MAX_ITERATIONS)
     deadline = math.inf if time_limit is None else clock() + time_limit
     distances = landmark_distances(problem)
-    bound = lower_bound(problem, objective, distances)
+    bound = lower_bound(problem, objective, problem_distances(problem))
     search = Search(distances, problem.n_agents, objective, seed)
     best = UNBOUNDED
     chunk = 1
