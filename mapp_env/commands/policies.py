@@ -112,7 +112,7 @@ def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
     env = CentralEnv(
         problem.grid, problem.n_agents, len(problem.landmarks), max_cycles, central_action="multi"
     )
-    observation, _ = env.reset(seed=0, options={"landmarks": problem.landmarks})
+    observation, _ = env.reset(seed=0, options={"problem": replace(problem, max_cycles=None)})
     actions, over = [], False
     while not over:
         with _refusing("--policy cannot play this problem"):

@@ -80,8 +80,11 @@ def run(arguments: argparse.Namespace) -> None:
     problem, plan = _plan_of(arguments)
     size = draw(problem, plan)
     record = {"out": arguments.out, "bytes": size, "landmarks": list(problem.landmarks)}
+    if problem.starts is not None:
+        record["starts"] = list(problem.starts)
     wrote = f"wrote {arguments.out}: {size} bytes"
     lines = [wrote, reports.costs_line(problem, plan), reports.landmarks_line(problem)]
+    lines += reports.starts_lines(problem)
     reports.print_report(arguments, {**record, **reports.costs_record(plan)}, lines)
 
 
