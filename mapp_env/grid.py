@@ -320,25 +320,30 @@ def fill_distances(
 ) -> None:
     """Breadth-first search: write the steps from a free cell to every cell, shape (C,).
 
-    They are -1 where unreachable. ``queue``, shape (C,), is scratch space. Beyond ``stop`` no
-    distances are needed; those of all nearer cells are complete.
+    They are -1 where unreachable. ``moves``, (C, 4 or more), is a table whose first four columns
+    are the moves; ``queue``, (C,), is scratch space. Beyond ``stop`` no distances are needed; those
+    of all nearer cells are complete.
     """
     steps[:] = -1
     steps[start] = 0
-    queue[0] = start
-    head = 0
-    tail = 1
-    while head < tail:
-        cell = queue[head]
-        head += 1
+    # The start itself is never in the queue, so that a place is left behind the last cell found:
+    # each cell looked at is written there, and counted if it is new. Whether it is, is as good as
+    # random, and to guess it wrong would cost more than all the rest.
+    cell = np.uint32(start)
+    head = np.uint32(0)
+    tail = np.uint32(0)
+    while cell != stop:
+        ahead = np.uint32(steps[cell]) + np.uint32(1)
         for action in range(4):
-            to = moves[cell, action]
-            if steps[to] < 0:
-                steps[to] = steps[cell] + 1
-                if to == stop:
-                    return
-                queue[tail] = to
-                tail += 1
+            to = np.uint32(moves[cell, action])
+            known = np.uint32(steps[to])  # -1 becomes more than any number of steps
+            queue[tail] = to
+            tail += np.uint32(known > ahead)
+            steps[to] = min(known, ahead)
+        if head == tail:
+            return
+        cell = np.uint32(queue[head])
+        head += np.uint32(1)
 
 
 @kernel
