@@ -45,7 +45,7 @@ def make_grid(name: str = "paper-7x7", **options: Any) -> Grid:
         - ``"maze"``: a maze (:func:`~mapp_env.grids.generators.maze_grid`);
         - ``"warehouse"``: shelves and aisles (:func:`~mapp_env.grids.generators.warehouse_grid`).
     **options
-        Of a generator: ``rows`` and ``cols`` up to 512, ``seed``, and ``density`` of "random",
+        Of a generator: ``rows`` and ``cols`` up to 2048, ``seed``, and ``density`` of "random",
         ``room`` of "rooms", ``loops`` of "maze", ``shelf_length``, ``aisle`` and ``gaps`` of
         "warehouse". Every free cell of a generated grid can be reached from its depot.
 

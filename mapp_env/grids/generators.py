@@ -33,7 +33,7 @@ def random_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, density: float
     Parameters
     ----------
     rows, cols : int
-        2 to 512.
+        2 to 2048.
     seed : int
         Which of them.
     density : float
@@ -66,11 +66,11 @@ def rooms_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, room: int = 5) 
     Parameters
     ----------
     rows, cols : int
-        3 to 512.
+        3 to 2048.
     seed : int
         Which of them.
     room : int
-        Shortest side of a room, 2 to 256; no room is longer than three times that, except where a
+        Shortest side of a room, 2 to 1024; no room is longer than three times that, except where a
         wall would block a door.
 
     Raises
@@ -129,7 +129,7 @@ def maze_grid(*, rows: int = 33, cols: int = 33, seed: int = 0, loops: float = 0
     Parameters
     ----------
     rows, cols : int
-        3 to 512.
+        3 to 2048.
     seed : int
         Which of them.
     loops : float
@@ -188,11 +188,11 @@ def warehouse_grid(
     Parameters
     ----------
     rows, cols : int
-        6 to 512.
+        6 to 2048.
     seed : int
         Which shelves are missing.
     shelf_length : int
-        Cells along a shelf, 2 to 256; a shelf is shorter where the grid is.
+        Cells along a shelf, 2 to 1024; a shelf is shorter where the grid is.
     aisle : int
         Width of aisles, 1 to 8; less at the edges of a narrow grid.
     gaps : float
