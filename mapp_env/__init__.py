@@ -18,7 +18,7 @@ from mapp_env import mapp_v0, solvers
 from mapp_env.envs.vector_env import make_vec
 from mapp_env.files import FileError
 from mapp_env.grid import Grid
-from mapp_env.grids import grid_names, make_grid
+from mapp_env.grids import grid_names, load_grids, make_grid, make_grids
 from mapp_env.map_format import MapError
 from mapp_env.plans.plan import Plan, replay
 from mapp_env.problem import Problem, sample_problems
@@ -32,7 +32,9 @@ __all__ = [
     "Problem",
     "__version__",
     "grid_names",
+    "load_grids",
     "make_grid",
+    "make_grids",
     "make_vec",
     "mapp_v0",
     "replay",

@@ -217,10 +217,11 @@ def cell_table(grid: Grid) -> NDArray[np.int32]:
     so that borders and walls vanish from the rules. The mask is four int8 in one word: 0 for a move
     that bumps, else 1.
     """
-    cells = np.arange(grid.n_cells)
-    row, col = np.divmod(cells, grid.cols)
-    mask = (grid.moves != cells[:, None]).view(np.int32)
-    columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel(), mask]
-    table = np.column_stack(columns).astype(np.int32)
+    cells = np.arange(grid.n_cells, dtype=np.int32)
+    table = np.empty((grid.n_cells, MASK + 1), np.int32)
+    table[:, :WAIT], table[:, WAIT] = grid.moves, cells
+    table[:, ROW], table[:, COL] = np.divmod(cells, np.int32(grid.cols))
+    table[:, HOME], table[:, WALL] = grid.home, grid.walls.ravel()
+    table[:, MASK] = (grid.moves != cells[:, None]).view(np.int32)[:, 0]
     table.flags.writeable = False
     return table
