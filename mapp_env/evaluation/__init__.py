@@ -12,6 +12,7 @@ from mapp_env.evaluation.optima import find_losses, proven_costs
 from mapp_env.evaluation.policies import Acting, Policy, acting
 from mapp_env.evaluation.problems import read_groups
 from mapp_env.evaluation.progress import Progress
+from mapp_env.evaluation.summary import LOSSES
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.validation import check_choice, check_flag
 
@@ -19,6 +20,12 @@ __all__ = ["evaluate"]
 
 OWN = ("num_envs", "n_landmarks", "central_action", "autoreset_mode", "render_mode")
 """Arguments of a batched environment that are not for whoever judges."""
+
+RESULTS = (
+    *("solved", "cost", "optimum", "bound", "gap", "visited", "steps", "regret"),
+    *LOSSES,
+    *OBJECTIVES,
+)
 
 
 def evaluate(
@@ -135,11 +142,3 @@ def evaluate(
             found[name][group.places] = value
     bar.close()
     return found
-
-
-LOSSES = ("lost_first", "lost_middle", "lost_last")
-RESULTS = (
-    *("solved", "cost", "optimum", "bound", "gap", "visited", "steps", "regret"),
-    *LOSSES,
-    *OBJECTIVES,
-)

@@ -56,7 +56,7 @@ def check_grid(policy: object, grid: Grid) -> None:
         own = getattr(policy, "grid", None)
     if isinstance(own, Grid) and own != grid:
         raise ValueError(
-            f"policy must be one of this grid, or of any, got one of another; here "
+            f"policy must be one of this grid, or of any, got one of another grid; here "
             f"{tell_apart(grid, own)}"
         )
 

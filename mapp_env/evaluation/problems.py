@@ -36,7 +36,7 @@ class Group(NamedTuple):
     @property
     def n_agents(self) -> int:
         """How many agents each has."""
-        return self.starts.shape[1]
+        return int(self.starts.shape[1])
 
     @property
     def from_depots(self) -> NDArray[np.bool_]:
@@ -120,7 +120,7 @@ def read_groups(
     """
     if max_cycles is not None:
         check_count("max_cycles", max_cycles, 1, MAX_CYCLES)
-    found = _read(problems)
+    found = read_problems(problems)
     if found is None:
         rows, whole = _read_rows(problems, grid)
         agents = DEFAULT_AGENTS if n_agents is None else n_agents
@@ -139,22 +139,24 @@ def read_groups(
     return group_problems(found, limits)
 
 
-def _read(problems: object) -> list[Problem] | None:
-    """Return problems, from files if need be; None if they are rows of landmarks."""
+def read_problems(problems: object) -> list[Problem] | None:
+    """Return problems, from files if need be; None if they are neither."""
     if isinstance(problems, str | os.PathLike):
-        return _load(problems)
-    if isinstance(problems, np.ndarray) or not isinstance(problems, Sequence):
+        return load_problems(problems)
+    if isinstance(problems, np.ndarray) or not isinstance(problems, Sequence) or not problems:
         return None
-    if not problems:
-        raise ValueError(f"problems must hold at least one of {FORMS}, got {describe(problems)}")
     if all(isinstance(each, Problem) for each in problems):
         return list(problems)
     if all(isinstance(each, str | os.PathLike) for each in problems):
-        return [problem for path in problems for problem in _load(path)]
+        return [problem for path in problems for problem in load_problems(path)]
     return None
 
 
-def _load(path: str | os.PathLike[str]) -> list[Problem]:
+def load_problems(path: str | os.PathLike[str]) -> list[Problem]:
+    """Return the problem of a file, or those of all problem files in a folder, by name.
+
+    Raises a ValueError if there is none, or a file cannot be read.
+    """
     folder = Path(path)
     files = [folder]
     if folder.is_dir():
