@@ -86,7 +86,7 @@ def find_optima(setting: Setting, landmarks: np.ndarray) -> Optima | None:
     group, costs = setting.group(landmarks), []
     for objective in OBJECTIVES:
         bar = Progress(f"optima: {objective}", len(landmarks))
-        costs.append(proven_costs(group, objective, bar).optimum.astype(np.int32))
+        costs.append(proven_costs(group, objective, progress=bar).optimum.astype(np.int32))
         bar.close()
     return Optima(*costs)
 

@@ -31,7 +31,7 @@ RESULTS = (
 def evaluate(
     policy: Policy | Acting,
     problems: Any,
-    objective: str = "cover_time",
+    objective: str | None = None,
     *,
     grid: Any = None,
     n_agents: int | None = None,
@@ -51,8 +51,9 @@ def evaluate(
     problems : sequence of Problem, path or sequence of paths, or array_like of int, shape (P, K)
         What is played: problems, of whatever grids and sizes; problem files, or a folder of them
         (``*.json``, by name); or the landmark cells of problems of one ``grid``, a row each.
-    objective : {"cover_time", "makespan", "total_distance"}
-        What ``cost`` is.
+    objective : {"cover_time", "makespan", "total_distance"}, optional
+        What ``cost`` is: the cover time unless said otherwise; with ``return_home``, where the
+        team has to be home as well, the makespan.
     grid : str, path or Grid, optional
         Of landmark cells; problems bring their own.
     n_agents : int, optional
@@ -60,39 +61,49 @@ def evaluate(
     max_cycles : int, optional
         Step limit of all episodes. By default each problem's own or, if it has none, as many steps
         as a single agent may need that walks from each landmark to the next: 2 K times the
-        distance from the depot to the farthest cell.
+        distance from the depot to the farthest cell, 2 K + 2 times with ``return_home``.
     progress : bool
         Whether a bar says how far the work is, on the standard error stream, if it is a terminal.
     **env_arguments
         Arguments of the environment, as :func:`mapp_env.make_vec` takes them: ``observation``,
-        ``reward``, ``allow_wait``.
+        ``actions``, ``return_home``, ``allow_wait``, ``reward``. Problems of several grids are
+        played as a pool, but with ``observation="planes"`` only those whose grids have the same
+        sides, so that planes are as large as the grid.
 
     Returns
     -------
     dict of str to ndarray, shape (P,)
         One entry for each problem, in the order given:
 
-        - ``solved`` (bool): whether all landmarks were visited within the step limit;
+        - ``solved`` (bool): whether all landmarks were visited (with ``return_home``, and all
+          agents home) within the step limit;
         - ``cost``: of the episode in ``objective``, steps (or moves), infinite if it was not
           solved; ``cover_time``, ``makespan`` and ``total_distance``: the same, in each;
         - ``optimum``: the least cost of any plan, proven up to 20 landmarks, or where the cost
-          meets the bound; else NaN;
+          meets the bound; else NaN (some with ``return_home``, see below);
         - ``bound``: a proven lower bound, equal to the optimum where there is one;
         - ``gap``: (cost - optimum) / optimum; NaN where unsolved, or without an optimum;
         - ``visited``: the share of landmarks visited at the end;
         - ``steps`` (int): decisions until the end;
         - ``regret``: steps lost a decision, the mean over an episode: the regret of a decision is
-          the least cover time from after it, plus 1, less that from before it. NaN for other
-          objectives, and beyond 12 landmarks;
+          the least cover time (with ``return_home``, the least makespan) from after it, plus 1,
+          less that from before it. NaN for other objectives, and beyond 12 landmarks;
         - ``lost_first``, ``lost_middle``, ``lost_last``: steps lost in all by the first decision;
-          by later ones, while more than one landmark was left; by those with one left. They add
-          up to cost - optimum where the problem was solved.
+          by later ones, while more than one landmark was left; by those with one left, or none.
+          They add up to cost - optimum where the problem was solved.
 
     Raises
     ------
     ValueError
         If an argument is invalid, the policy fails or returns no such actions, or it is of another
         grid than a problem.
+
+    Notes
+    -----
+    With ``return_home`` all agents walk home, also idle ones that start elsewhere. If they can
+    neither wait nor walk into a wall beside the depot, some of these makespans cannot be met; then
+    the optimum is NaN unless the policy meets the bound. So is that of the total distance, if
+    agents start elsewhere.
 
     Examples
     --------
@@ -103,13 +114,17 @@ def evaluate(
     >>> float(found["cost"][0]), float(found["optimum"][0])
     (2.0, 2.0)
     """
-    check_choice("objective", objective, OBJECTIVES)
     for name in OWN:
         if name in env_arguments:
             raise ValueError(f"{name} must be left out: an evaluation has its own")
+    home = check_flag("return_home", env_arguments.get("return_home", False))
+    counted = "makespan" if home else "cover_time"  # by the episode's steps
+    objective = check_choice("objective", objective or counted, OBJECTIVES)
     acting(policy)
     shown = check_flag("progress", progress)
-    groups = read_groups(problems, grid, n_agents, max_cycles)
+    by_shape = env_arguments.get("observation") == "planes"
+    groups = read_groups(problems, grid, n_agents, max_cycles, home, by_shape)
+    may_rest = bool(env_arguments.get("allow_wait")) or env_arguments.get("actions") == "landmarks"
     total = sum(len(group.places) for group in groups)
     found = {name: np.full(total, np.nan) for name in RESULTS}
     found["solved"], found["steps"] = np.zeros(total, np.bool_), np.zeros(total, np.int64)
@@ -118,7 +133,7 @@ def evaluate(
     bar.close()
     bar = Progress("optima" if shown else None, total)
     for group, episodes in zip(groups, played, strict=True):
-        optimum, bound = proven_costs(group, objective, bar)
+        optimum, bound = proven_costs(group, objective, home, may_rest, bar)
         cost = episodes.costs[objective]
         proven = np.where(cost == bound, bound, optimum)
         if (cost < bound).any():
@@ -134,8 +149,8 @@ def evaluate(
             "visited": 1.0 - episodes.moments.left[-1].mean(axis=1),
             "steps": episodes.steps,
         }
-        if objective == "cover_time":
-            losses = find_losses(group, episodes.moments, optimum)
+        if objective == counted:
+            losses = find_losses(group, episodes.moments, optimum, home)
             values["regret"] = losses.sum(axis=0) / episodes.steps
             values |= dict(zip(LOSSES, losses, strict=True))
         for name, value in values.items():

@@ -17,6 +17,7 @@ from mapp_env.validation import as_array, check_count, describe
 
 SUFFIX = ".json"  # of problem files in a folder
 DEFAULT_AGENTS = 3
+MAX_POOL_CELLS = 1 << 22  # of all grids of a group: tables of 160 MiB
 
 FORMS = (
     "mapp_env.Problems, problem files, a folder of these, or landmarks of shape (P, K) with grid="
@@ -44,6 +45,17 @@ class Group(NamedTuple):
         depots = np.array([grid.depot for grid in self.grids])[self.which]
         found: NDArray[np.bool_] = (self.starts == depots[:, None]).all(axis=1)
         return found
+
+    @property
+    def cols(self) -> NDArray[np.int64]:
+        """Columns of each one's grid, (P,)."""
+        found: NDArray[np.int64] = np.array([grid.cols for grid in self.grids])[self.which]
+        return found
+
+    @property
+    def pool(self) -> Grid | tuple[Grid, ...]:
+        """The grid of an environment for them."""
+        return self.grids[0] if len(self.grids) == 1 else self.grids
 
     def part(self, rows: NDArray[np.int64]) -> Group:
         """Return some of them."""
@@ -84,14 +96,31 @@ def group_rows(
     )
 
 
-def group_problems(problems: Sequence[Problem], limits: Sequence[int]) -> list[Group]:
-    """Return problems of any grids and sizes in groups of equal N and K, the first one's first."""
+def group_problems(
+    problems: Sequence[Problem], limits: Sequence[int], by_shape: bool = False
+) -> list[Group]:
+    """Return problems of any grids and sizes in groups of equal N and K, the first one's first.
+
+    ``limits`` are their step limits; ``by_shape`` keeps grids of different sides apart.
+    """
     alike: dict[tuple[object, ...], list[int]] = {}
     for place, problem in enumerate(problems):
-        # A batch still has one grid, and one step limit.
-        key = problem.grid, limits[place], problem.n_agents, len(problem.landmarks)
-        alike.setdefault(key, []).append(place)
-    return [_group(problems, limits, places) for places in alike.values()]
+        shape = problem.grid.walls.shape if by_shape else None
+        alike.setdefault((problem.n_agents, len(problem.landmarks), shape), []).append(place)
+    groups = []
+    for places in alike.values():
+        pool: dict[Grid, int] = {}
+        room, first = MAX_POOL_CELLS, 0
+        for last, place in enumerate(places):
+            grid = problems[place].grid
+            if grid not in pool and pool and grid.n_cells > room:
+                groups.append(_group(problems, limits, places[first:last]))
+                pool, room, first = {}, MAX_POOL_CELLS, last
+            if grid not in pool:
+                pool[grid] = len(pool)
+                room -= grid.n_cells
+        groups.append(_group(problems, limits, places[first:]))
+    return groups
 
 
 def _group(problems: Sequence[Problem], limits: Sequence[int], places: list[int]) -> Group:
@@ -113,8 +142,11 @@ def read_groups(
     n_agents: int | None = None,
     max_cycles: int | None = None,
     return_home: bool = False,
+    by_shape: bool = False,
 ) -> list[Group]:
     """Return what :func:`mapp_env.evaluate` is given as groups; the arguments are its own.
+
+    ``by_shape`` is as in :func:`group_problems`.
 
     Raises a ValueError if there is no problem, or one is invalid.
     """
@@ -136,7 +168,7 @@ def read_groups(
         max_cycles or each.max_cycles or enough_steps(each.grid, len(each.landmarks), return_home)
         for each in found
     ]
-    return group_problems(found, limits)
+    return group_problems(found, limits, by_shape)
 
 
 def read_problems(problems: object) -> list[Problem] | None:
