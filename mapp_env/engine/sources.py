@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,12 @@ from mapp_env.compiled import kernel
 from mapp_env.engine.task import Task
 from mapp_env.problem import Problem, check_landmarks, draw_landmarks
 from mapp_env.validation import describe
+
+OPTIONS = ("landmarks", "problem")
+"""What ``reset(options=...)`` knows."""
+
+BATCH_OPTIONS = (*OPTIONS, "reset_mask")
+"""What it knows in a batch."""
 
 
 def draw_problems(task: Task, words: NDArray[np.uint64]) -> NDArray[np.int32]:
@@ -29,11 +37,33 @@ def _draw_rows(
         draw_landmarks(word, candidates, landmarks[row])
 
 
+def warn_of_unknown(options: Mapping[str, Any] | None, known: Sequence[str]) -> None:
+    """Warn of options that are not ``known``: a typo would train on another task in silence.
+
+    The one that PettingZoo's own tests pass, ``{"options": 1}``, is let through.
+    """
+    if not isinstance(options, Mapping):
+        return
+    given = [key for key in options if key != "options" or type(options[key]) is not int]
+    unknown = [key for key in given if key not in known]
+    if not unknown:
+        return
+    named = [key for key in unknown[:8] if isinstance(key, str)]
+    meant = dict.fromkeys(near for key in named for near in get_close_matches(key, known))
+    hint = f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
+    warnings.warn(
+        f"options of reset() that are unknown are ignored: {', '.join(map(describe, unknown[:8]))}"
+        f"{hint}; known are {', '.join(map(repr, known))}",
+        UserWarning,
+        stacklevel=3,
+    )
+
+
 def check_options(task: Task, options: Mapping[str, Any] | None) -> Problem | None:
     """Return the problem that ``reset(options=...)`` asks for, or ``None`` for a random one.
 
     ``"landmarks"`` holds cells or (row, col) pairs, ``"problem"`` a whole problem on the task's
-    grid with as many agents and landmarks. Other keys are ignored.
+    grid with as many agents and landmarks. Other keys are not looked at.
 
     Raises a ValueError if the options are invalid.
     """

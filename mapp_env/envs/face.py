@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from mapp_env.engine.simulation import Simulation
-from mapp_env.engine.sources import check_options
+from mapp_env.engine.sources import OPTIONS, check_options, warn_of_unknown
 from mapp_env.engine.task import RENDER_MODES, Task
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
@@ -65,6 +65,7 @@ class Face:
         if seed is not None:
             seed = check_count("seed", seed, 0, MAX_SEED)
         problem = check_options(self.task, options)
+        warn_of_unknown(options, OPTIONS)
         if seed is not None:
             self._np_random, self._np_random_seed = seeding.np_random(seed)
         self._simulation.reset(problem, self.np_random)

@@ -98,7 +98,8 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
             operating system's entropy at first).
         options : dict, optional
             ``{"landmarks": cells or (row, col) pairs}`` or ``{"problem": Problem}`` fixes the
-            problem, and draws nothing from the generator. Other keys are ignored.
+            problem, and draws nothing from the generator. Other keys are ignored, with a
+            warning.
 
         Returns
         -------

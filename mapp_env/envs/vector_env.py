@@ -17,7 +17,13 @@ from mapp_env.engine.loops import find_bad_action
 from mapp_env.engine.observation import Observation
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
-from mapp_env.engine.sources import check_problems, check_reset_mask, draw_problems
+from mapp_env.engine.sources import (
+    BATCH_OPTIONS,
+    check_problems,
+    check_reset_mask,
+    draw_problems,
+    warn_of_unknown,
+)
 from mapp_env.engine.task import Task
 from mapp_env.envs.arguments import BATCH_RENDER_MODES, AutoresetMode, BatchTask, takes
 from mapp_env.envs.central_env import CentralEnv, central_action_space
@@ -41,7 +47,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         Number of rows B, 1 to 1,048,576.
     autoreset_mode : gymnasium.vector.AutoresetMode or str
         When a finished row starts its next episode: ``NEXT_STEP`` (Gymnasium's default),
-        ``SAME_STEP`` or ``DISABLED``, with infos where Gymnasium puts them.
+        ``SAME_STEP`` or ``DISABLED``, as a string in this or Gymnasium's spelling (``"NextStep"``),
+        with infos where Gymnasium puts them.
     central_action : {"multi", "joint", "auto"}
         Actions of shape (B, N), one per agent, or (B,), numbered joint actions.
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
@@ -127,7 +134,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         options : dict, optional
             ``"reset_mask"``: bool, shape (B,). ``"landmarks"`` or ``"problem"``: as in the single
             environment, for all rows alike; or the landmarks of each row as an int array of cells,
-            shape (B, K), or of (row, col) pairs, shape (B, K, 2). Other keys are ignored.
+            shape (B, K), or of (row, col) pairs, shape (B, K, 2). Other keys are
+            ignored, with a warning.
 
         Returns
         -------
@@ -146,6 +154,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if not self._started and not mask.all():
             raise ValueError("options['reset_mask'] must be all True in the first reset")
         landmarks, limit = check_problems(self.task, options, self.num_envs)
+        warn_of_unknown(options, BATCH_OPTIONS)
         indices = np.flatnonzero(mask)
         self._seeds.seed(seeds, indices.tolist())
         if landmarks is None:
