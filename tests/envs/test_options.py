@@ -12,7 +12,7 @@ import pytest
 
 import mapp_env
 from mapp_env import mapp_v0
-from mapp_env.engine.sources import BATCH_OPTIONS, OPTIONS
+from mapp_env.engine.options import BATCH_OPTIONS, OPTIONS
 from mapp_env.envs.arguments import AutoresetMode
 
 FACES: dict[str, Callable[[], Any]] = {
