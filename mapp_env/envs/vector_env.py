@@ -109,6 +109,16 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     def max_cycles(self, value: int) -> None:
         self._rows.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
 
+    def state(self) -> NDArray[np.float32]:
+        """Return each row's global observation (R9), shape (B, N + 2K), whatever agents see.
+
+        It is for central critics. In same-step mode rows that ended have begun their next episode.
+        Raises a ResetNeeded before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("state() needs episodes: call reset() first")
+        return self._rows.state.head.astype(np.float32)
+
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The seed of each row; a single environment reset with it is that row."""
