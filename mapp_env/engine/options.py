@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +14,12 @@ from mapp_env.engine.sources import NO_GRIDS, OWN_LIMIT, Problems, Source
 from mapp_env.engine.task import Task
 from mapp_env.problem import Problem, check_landmarks
 from mapp_env.validation import as_array, as_integer, describe
+
+OPTIONS = ("landmarks", "grid", "problem")
+"""What ``reset(options=...)`` knows."""
+
+BATCH_OPTIONS = (*OPTIONS, "reset_mask")
+"""What it knows in a batch."""
 
 
 class Asked(NamedTuple):
@@ -24,12 +32,36 @@ class Asked(NamedTuple):
 NOTHING = Asked(NO_GRIDS, None)
 
 
+def warn_of_unknown(options: Mapping[str, Any] | None, known: Sequence[str]) -> None:
+    """Warn of options that are not ``known``: a typo would train on another task in silence.
+
+    The one that PettingZoo's own tests pass, ``{"options": 1}``, is let through.
+    """
+    given = options or {}
+    unknown = [
+        key
+        for key, value in given.items()
+        if key not in known and not (key == "options" and type(value) is int)
+    ]
+    if not unknown:
+        return
+    named = [key for key in unknown[:8] if isinstance(key, str)]
+    meant = dict.fromkeys(near for key in named for near in get_close_matches(key, known))
+    hint = f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
+    warnings.warn(
+        f"options of reset() that are unknown are ignored: {', '.join(map(describe, unknown[:8]))}"
+        f"{hint}; known are {', '.join(map(repr, known))}",
+        UserWarning,
+        stacklevel=3,
+    )
+
+
 def check_options(source: Source, task: Task, options: Mapping[str, Any] | None) -> Asked:
     """Return what a single environment is asked for.
 
     ``"landmarks"`` holds cells or (row, col) pairs; ``"grid"`` the number of a grid of the pool,
     and without landmarks they are drawn on it; ``"problem"`` a whole problem on one of the task's
-    grids with as many agents and landmarks. Other keys are ignored.
+    grids with as many agents and landmarks. Other keys are not looked at.
 
     Raises a ValueError if the options are invalid.
     """
