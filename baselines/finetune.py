@@ -49,7 +49,7 @@ from baselines.policies.settings import N_ACTIONS, PolicyOfRun, load_run
 from baselines.replay.imagined import UNKNOWN, join
 from mapp_env import Plan, Problem, mapp_v0, replay, solve
 from mapp_env.engine.loops import visit_rows
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 
 # Values of one network differ by tenths where logits of another differ by tens: actions are drawn
 # at inverse temperatures from one end to the other, episode by episode.

@@ -29,7 +29,7 @@ from baselines.policies.evaluation import EVALUATION_SEED, find_optima, unseen_p
 from baselines.policies.settings import N_ACTIONS, Setting
 from mapp_env.engine.loops import visit_rows
 from mapp_env.engine.rules import Reward
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 from mapp_env.grids import find_grid
 from mapp_env.validation import check_choice
 

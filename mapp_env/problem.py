@@ -10,13 +10,16 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.engine.rules import reset_row, step_row
+from mapp_env.engine.state import WAIT, new_rows, split
+from mapp_env.engine.world import make_world
 from mapp_env.files import FileError
 from mapp_env.grid import Grid
 from mapp_env.records import MAX_PROBLEM_BYTES, Record, read_record, write_record
-from mapp_env.validation import check_count, describe
+from mapp_env.validation import as_array, check_count, describe
 
 MAX_AGENTS = 16
 MAX_LANDMARKS = 256
@@ -104,6 +107,54 @@ class Problem:
         """
         return cls.from_record(read_record(path, "problem", MAX_PROBLEM_BYTES))
 
+    def after(self, joint_actions: ArrayLike) -> Problem | None:
+        """Return the problem that is left after some steps by the rules.
+
+        Its landmarks are those that are not visited, in the same order, its starts the cells where
+        the agents stand. A step limit is lowered by the steps taken.
+
+        Parameters
+        ----------
+        joint_actions : array_like of int, shape (T, N)
+            0 left, 1 right, 2 up, 3 down, 4 wait for each agent at each step. Those after the last
+            landmark is visited are not carried out.
+
+        Returns
+        -------
+        Problem or None
+            ``None`` if every landmark is visited.
+
+        Raises
+        ------
+        ValueError
+            If the shape is wrong, an action is not one, or landmarks are left when the step limit
+            is reached.
+        """
+        actions = check_joint_actions(joint_actions, self.n_agents)
+        n_landmarks = len(self.landmarks)
+        world = make_world(self.grid, self.n_agents, n_landmarks)
+        row = new_rows(1, self.n_agents, n_landmarks)[0]
+        landmarks, cells = np.array(self.landmarks, np.int32), np.array(self.start_cells, np.int32)
+        reset_row(row, landmarks, cells, world)
+        limit = self.max_cycles or MAX_CYCLES + len(actions)
+        for joint_action in actions:
+            _, terminated, truncated = step_row(row, joint_action, limit, world)
+            if terminated:
+                return None
+            if truncated:
+                raise ValueError(
+                    f"joint_actions must be less than the problem's step limit of {limit} if "
+                    f"landmarks are left, got {len(actions)} steps"
+                )
+        state = split(row, self.n_agents, n_landmarks)
+        return Problem(
+            self.grid,
+            tuple(landmarks[state.visited == 0].tolist()),
+            self.n_agents,
+            None if self.max_cycles is None else limit - len(actions),
+            tuple(state.cells.tolist()),
+        )
+
     def to_record(self) -> dict[str, Any]:
         """Return the problem as the fields of a file."""
         return {
@@ -133,6 +184,28 @@ class Problem:
             return cls(Grid.from_text(text), landmarks, n_agents, max_cycles, starts)
         except ValueError as error:
             raise FileError(f"{record.where}: {error}") from error
+
+
+def check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]:
+    """Return joint actions as an int64 array of shape (T, N).
+
+    Raises a ValueError if the shape is wrong or an action is not one.
+    """
+    array = as_array(joint_actions)
+    if array.shape in ((0,), (0, n_agents)):
+        return np.empty((0, n_agents), np.int64)
+    if array.ndim != 2 or array.shape[1] != n_agents or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"joint_actions must be integers of shape (T, {n_agents}), "
+            f"got {describe(joint_actions)}"
+        )
+    wrong = np.argwhere((array < 0) | (array > WAIT))
+    if len(wrong):
+        step, agent = wrong[0].tolist()
+        raise ValueError(
+            f"joint_actions[{step}, {agent}] must be in 0..{WAIT}, got {array[step, agent]}"
+        )
+    return np.ascontiguousarray(array, np.int64)
 
 
 def check_grid(name: str, value: object) -> Grid:

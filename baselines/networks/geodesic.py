@@ -12,7 +12,7 @@ from baselines.networks.layers import Head, encode, linear
 from mapp_env import Grid
 from mapp_env.engine.loops import observe_rows
 from mapp_env.engine.observation import N_FEATURES, Observation
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.validation import check_count
 

@@ -24,7 +24,7 @@ from baselines.runs.checkpoints import take
 from mapp_env import Grid
 from mapp_env.compiled import nogil_kernel
 from mapp_env.engine.loops import visit_rows
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 
 UNKNOWN = -1
 

@@ -21,7 +21,7 @@ from mapp_env import Grid
 from mapp_env.engine.loops import visit_rows
 from mapp_env.engine.rules import Reward
 from mapp_env.engine.state import World, split
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 
 
 class RelabelledReward(NamedTuple):

@@ -13,11 +13,10 @@ from stable_baselines3.common.monitor import Monitor
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv, Stepped
 from mapp_env.engine.seeds import spread_seed
-from mapp_env.engine.sources import check_options
 from mapp_env.envs.central_env import central_action_masks
 from mapp_env.envs.vector_env import MappVectorEnv
 from mapp_env.envs.vector_infos import Transition
-from mapp_env.grid import pairs_of
+from mapp_env.problem import Problem
 from mapp_env.validation import MAX_SEED, check_count, describe
 
 __all__ = ["MappSb3VecEnv", "make_sb3_vec"]
@@ -108,8 +107,9 @@ class MappSb3VecEnv(RowsVecEnv):
         Parameters
         ----------
         options : dict or list of dict, optional
-            ``"landmarks"`` or ``"problem"`` for all rows alike, or the landmarks of each row as
-            cells, shape (B, K). A list has a dict for each row, all with ``"landmarks"``.
+            As the batch takes them: ``"grid"``, ``"landmarks"`` or ``"problem"``, for all rows
+            alike or for each. A list has a dict for each row, all with ``"landmarks"`` or
+            ``"problem"``.
 
         Raises
         ------
@@ -121,31 +121,30 @@ class MappSb3VecEnv(RowsVecEnv):
                 raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
             self._next_options = None if options is None else deepcopy(dict(options))
             return
-        cells = np.array(self._landmarks_by_row(options))
-        # As pairs: two rows of two cells could as well be two pairs.
-        self._next_options = {"landmarks": pairs_of(self.engine.task.grid, cells)}
+        self._next_options = {"problem": self._problems_of(options)}
 
-    def _landmarks_by_row(self, options: Any) -> list[tuple[int, ...]]:
-        """Return the landmarks of a list of options, one a row."""
+    def _problems_of(self, options: Any) -> list[Problem]:
+        """Return the problems of a list of options, one a row."""
         if not isinstance(options, Sequence) or len(options) != self.num_envs:
             raise ValueError(
-                f"options must be a dict, or a list of {self.num_envs} dicts with 'landmarks', one "
-                f"a row, got {describe(options)}"
+                f"options must be a dict, or a list of {self.num_envs} dicts with 'landmarks' or "
+                f"'problem', one a row, got {describe(options)}"
             )
-        found = []
+        problems = []
         for row, wanted in enumerate(options):
-            if not isinstance(wanted, Mapping) or set(wanted) != {"landmarks"}:
+            if not isinstance(wanted, Mapping) or not {"landmarks", "problem"} & set(wanted):
                 raise ValueError(
-                    f"options[{row}] must be a dict with 'landmarks' alone, got {describe(wanted)}"
+                    f"options[{row}] must be a dict with 'landmarks' (in an environment with a "
+                    f"pool also 'grid') or 'problem', got {describe(wanted)}"
                 )
             try:
-                problem = check_options(self.engine.task, dict(wanted))
+                problem = self.engine.find_problem(dict(wanted))
             except ValueError as error:
                 raise ValueError(f"options[{row}]: {error}") from error
             if problem is None:
-                raise ValueError(f"options[{row}]['landmarks'] must be cells, got None")
-            found.append(problem.landmarks)
-        return found
+                raise ValueError(f"options[{row}] must fix the landmarks, got {describe(wanted)}")
+            problems.append(problem)
+        return problems
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every row; return the observations, shape (B, ...).

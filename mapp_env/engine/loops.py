@@ -33,7 +33,7 @@ def step_and_observe(
     Raises a ValueError unless there is exactly one valid action per agent; nothing has moved then.
     (The rules index a table with actions: an invalid one would read outside of it.)
     """
-    own = World(*world)
+    own = world_at(World(*world), row, 0)
     if actions.shape[0] != own.n_agents:
         raise ValueError("actions must hold one action per agent")
     for agent in range(own.n_agents):
@@ -63,7 +63,7 @@ def step_rows(
     """
     common = World(*world)
     for index in range(rows.shape[0]):
-        own = world_at(common, index)
+        own = world_at(common, rows[index], index)
         if skip[index]:
             rewards[index] = 0.0
             terminations[index] = False
@@ -82,15 +82,27 @@ def observe_rows(
     """Observe the rows of ``indices``, (M,): theirs in ``views`` (B, V, F), ``masks`` (B, N, A)."""
     common = World(*world)
     for index in indices:
-        observe_row(rows[index], world_at(common, index), views[index], masks[index])
+        own = world_at(common, rows[index], index)
+        observe_row(rows[index], own, views[index], masks[index])
 
 
 @kernel
-def reset_rows(rows: Int32s, indices: Int64s, landmarks: Int32s, depot: int, world: Packed) -> None:
-    """Start an episode in the rows of ``indices``, (M,), on ``landmarks``, (M, K)."""
+def reset_rows(
+    rows: Int32s,
+    indices: Int64s,
+    grids: Int64s,
+    landmarks: Int32s,
+    cells: Int32s,
+    world: Packed,
+) -> None:
+    """Start an episode in the rows of ``indices``, (M,).
+
+    It is on the grids of these numbers, (M,), and on ``landmarks``, (M, K), with the agents on
+    ``cells``, (M, N).
+    """
     common = World(*world)
     for place, index in enumerate(indices):
-        reset_row(rows[index], landmarks[place], depot, common)
+        reset_row(rows[index], landmarks[place], cells[place], common, grids[place])
 
 
 @kernel
@@ -98,7 +110,8 @@ def measure_rows(rows: Int32s, indices: Int64s, costs: Float64s, world: Packed) 
     """Write the costs of some rows, (M, 3): cover time, makespan, total distance (R8)."""
     common = World(*world)
     for place, index in enumerate(indices):
-        cover_time, makespan, distance = measure_row(rows[index], common)
+        own = world_at(common, rows[index], index)
+        cover_time, makespan, distance = measure_row(rows[index], own)
         costs[place, 0] = cover_time
         costs[place, 1] = makespan
         costs[place, 2] = distance
@@ -126,23 +139,26 @@ def _visit_rows(rows: Int32s, rewards: Float64s, terminated: Bools, world: Packe
     common = World(*world)
     for index in range(rows.shape[0]):
         state = split_row(rows[index], common.n_agents, common.n_landmarks)
-        rewards[index], terminated[index] = visit_row(state, world_at(common, index))
+        own = world_at(common, rows[index], index)
+        rewards[index], terminated[index] = visit_row(state, own)
 
 
 @kernel
 def fill_fields(
     rows: Int32s, indices: Int64s, fields: Int32s, queue: Int32s, world: Packed
 ) -> None:
-    """Write the steps from every landmark of some rows: how grids too large for all pairs do it.
+    """Write the steps from every landmark of some rows, where there are no distances of all pairs.
 
-    Shapes: ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,).
+    Shapes: ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,), C of the largest grid.
     """
     common = World(*world)
     for index in indices:
-        state = split_row(rows[index], common.n_agents, common.n_landmarks)
-        for landmark in range(common.n_landmarks):
-            field = fields[index * common.n_landmarks + landmark]
-            fill_distances(common.table, state.landmarks[landmark], field, queue)
+        own = world_at(common, rows[index], index)
+        state = split_row(rows[index], own.n_agents, own.n_landmarks)
+        n_cells = own.table.shape[0]
+        for landmark in range(own.n_landmarks):
+            field = fields[index * own.n_landmarks + landmark, :n_cells]
+            fill_distances(own.table, state.landmarks[landmark], field, queue)
 
 
 @kernel

@@ -17,6 +17,7 @@ from mapp_env.engine.loops import (
     step_rows,
 )
 from mapp_env.engine.scene import TRAIL_MOVES, Scene
+from mapp_env.engine.sources import OWN_LIMIT, Problems
 from mapp_env.engine.state import new_rows, split
 from mapp_env.engine.task import Task
 from mapp_env.problem import MAX_CYCLES
@@ -39,7 +40,7 @@ class Rows:
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
         n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
-        self._fields = np.empty((n_fields, task.grid.n_cells), np.int32)
+        self._fields = np.empty((n_fields, task.largest), np.int32)
         self._every_row = np.arange(n_rows)
         self._checked: NDArray[np.int64] | None = None
         # Pictures show where agents have been: their cells at each step, for each row.
@@ -58,20 +59,17 @@ class Rows:
         self.__dict__.update(state)
         self._bind()
 
-    def start(
-        self, indices: NDArray[np.int64], landmarks: NDArray[np.int32], limit: int | None = None
-    ) -> None:
-        """Start an episode in the rows of ``indices``, (M,), on ``landmarks``, (M, K).
+    def start(self, indices: NDArray[np.int64], problems: Problems) -> None:
+        """Start an episode in the rows of ``indices``, (M,), on as many problems.
 
-        The landmarks come from :mod:`mapp_env.engine.sources`; the step limit is ``max_cycles``
-        unless another ``limit`` is given.
+        A problem that does not bring a step limit has ``max_cycles``.
         """
-        grid = self.task.grid
-        reset_rows(self.array, indices, landmarks, grid.depot, self.world)
+        reset_rows(self.array, indices, *problems[:3], self.world)
         if len(self._fields):
-            queue = np.empty(grid.n_cells, np.int32)
+            queue = np.empty(self.task.largest, np.int32)
             fill_fields(self.array, indices, self._fields, queue, self.world)
-        self.limits[indices] = min(self.max_cycles if limit is None else limit, self.longest)
+        limits = np.where(problems.limits == OWN_LIMIT, self.max_cycles, problems.limits)
+        self.limits[indices] = np.minimum(limits, self.longest)
         if self._trails is not None:
             for index in indices:
                 self._trails[index].clear()
@@ -157,7 +155,7 @@ class Rows:
         cells = tuple(state.cells[index].tolist())
         trail = [cells] if self._trails is None else self._trails[index]
         return Scene(
-            grid=self.task.grid,
+            grid=self.task.grids[state.grid[index, 0]],
             landmarks=tuple(state.landmarks[index].tolist()),
             visited=tuple(state.visited[index].astype(bool).tolist()),
             cells=cells,

@@ -6,7 +6,7 @@ stand in a file beside this one, over a row of their own, and share :func:`move_
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import numpy as np
@@ -16,12 +16,15 @@ from mapp_env.compiled import kernel
 from mapp_env.engine.state import (
     ALL_PAIRS,
     BY_COORDINATES,
-    COL,
+    DEPOT,
     HOME,
+    LANDMARKS,
+    N_ACTIONS,
     NO_DISTANCES,
-    ROW,
+    WAIT,
     State,
     World,
+    direct_steps,
     landmark_source,
     path_distances,
     split_row,
@@ -43,29 +46,39 @@ PATH_REWARDS = (Reward.GEODESIC,)  # those that look up shortest paths
 
 
 def reward_distances(
-    kind: Reward, grid: Grid, fields: NDArray[np.int32]
+    kind: Reward, grids: Sequence[Grid], fields: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], int]:
     """Return the distances that a reward looks up, shape (S, C), and the first landmark's line.
 
-    Parameters are those of :func:`mapp_env.engine.task.make_world`.
+    Parameters are those of :func:`mapp_env.engine.world.make_world`.
     """
     if kind in PATH_REWARDS:
-        return path_distances(grid, fields)
-    if grid.n_cells > MAX_TABLE_CELLS:
+        return path_distances(grids, fields)
+    # Grids of one shape have one table.
+    if grids[0].n_cells > MAX_TABLE_CELLS or len({grid.walls.shape for grid in grids}) > 1:
         return NO_DISTANCES, BY_COORDINATES
-    table = grid.manhattan_from(range(grid.n_cells))
+    table = grids[0].manhattan_from(range(grids[0].n_cells))
     table.flags.writeable = False
     return table, ALL_PAIRS
 
 
 @kernel
 def reset_row(
-    row: NDArray[np.int32], landmarks: NDArray[np.int32], depot: int, world: World
+    row: NDArray[np.int32],
+    landmarks: NDArray[np.int32],
+    cells: NDArray[np.int32],
+    world: World,
+    grid: int = 0,
 ) -> None:
-    """Start an episode (R2) on landmarks that satisfy its conditions, shape (K,)."""
+    """Start an episode (R2, R10) on landmarks, shape (K,), with the agents on cells, shape (N,).
+
+    Both satisfy the conditions of R2 and R10 on the world's grid of this number.
+    """
     row[:] = 0
     state = split_row(row, world.n_agents, world.n_landmarks)
-    state.cells[:] = depot
+    state.grid[0] = grid
+    for agent in range(world.n_agents):
+        state.cells[agent] = cells[agent]
     for landmark in range(world.n_landmarks):
         state.landmarks[landmark] = landmarks[landmark]
 
@@ -87,28 +100,66 @@ def step_row(
 
 @kernel
 def move_row(state: State, actions: NDArray[np.int64], world: World) -> None:
-    """Move all agents at once (R3, R4)."""
+    """Move all agents at once (R3, R4, R11)."""
     state.step[0] += 1
     for agent in range(world.n_agents):
         cell = state.cells[agent]
-        to = world.table[np.uint32(cell), np.uint32(actions[agent])]
+        move = actions[agent]
+        if world.actions == LANDMARKS:
+            move = _move_towards(state, world, cell, move)
+        to = world.table[np.uint32(cell), np.uint32(move)]
         state.cells[agent] = to
         state.moved[agent] += to != cell
 
 
 @kernel
+def _move_towards(state: State, world: World, cell: int, landmark: int) -> int:
+    """Return the first move on a shortest path to a landmark, or home for one more; else to wait.
+
+    Without ``return_home`` one more landmark means to stay (R11).
+    """
+    table = world.table
+    if landmark < world.n_landmarks:
+        steps = world.paths[landmark_source(state, landmark, world.first_path)]
+        for move in range(N_ACTIONS):
+            if steps[table[cell, move]] < steps[cell]:
+                return move
+    elif world.return_home:
+        for move in range(N_ACTIONS):
+            if table[table[cell, move], HOME] < table[cell, HOME]:
+                return move
+    return WAIT
+
+
+@kernel
 def visit_row(state: State, world: World) -> tuple[float, bool]:
-    """Visit the landmarks under agents (R5); return the team reward (R6) and if none is left."""
+    """Visit the landmarks under agents (R5); return the team reward (R6, R12) and if it is over."""
     first = world.first_field
     if first == BY_COORDINATES:
         unvisited, distance = _visit(state, world, _nearest_by_coordinates, world.table, first)
     else:
         unvisited, distance = _visit(state, world, _nearest_by_table, world.distances, first)
     if unvisited == 0:
-        return 0.0, True
+        if world.return_home:
+            distance = _steps_home(state, world)
+        if distance == 0:
+            return 0.0, True
     if world.reward == Reward.STEP:
         distance = 1
     return -float(distance), False
+
+
+@kernel
+def _steps_home(state: State, world: World) -> int:
+    """Return the sum of the agents' ways home, of the reward's kind; 0 only if all are there."""
+    total = 0
+    for agent in range(world.n_agents):
+        cell = state.cells[agent]
+        if world.reward == Reward.MANHATTAN:
+            total += direct_steps(world.table, cell, world.grids[0, DEPOT])
+        else:
+            total += world.table[cell, HOME]
+    return total
 
 
 @kernel
@@ -153,12 +204,10 @@ def _nearest_by_coordinates(
     state: State, world: World, landmark: int, table: NDArray[np.int32], first_field: int
 ) -> int:
     """Return the Manhattan distance from the nearest agent to a landmark, computed."""
-    cell = np.uint32(state.landmarks[landmark])
+    cell = state.landmarks[landmark]
     least = FAR
     for agent in range(world.n_agents):
-        at = np.uint32(state.cells[agent])
-        distance = abs(table[at, ROW] - table[cell, ROW]) + abs(table[at, COL] - table[cell, COL])
-        least = min(least, np.int32(distance))
+        least = min(least, np.int32(direct_steps(table, state.cells[agent], cell)))
     return least  # type: ignore[return-value]
 
 
@@ -180,21 +229,28 @@ def _claim(state: State, landmark: int) -> None:
 
 @kernel
 def measure_row(row: NDArray[np.int32], world: World) -> tuple[float, float, float]:
-    """Return cover time, makespan and total distance (R8), inf if a landmark is left.
+    """Return cover time, makespan and total distance (R8), inf if the episode is not solved.
 
     An agent's route is cut at its last claim and closed by a shortest path home; without a claim
-    it is empty.
+    it is empty. If the team walks home itself (R12), its steps are counted as they were.
     """
     state = split_row(row, world.n_agents, world.n_landmarks)
     for landmark in range(world.n_landmarks):
         if state.visited[landmark] == 0:
             return np.inf, np.inf, np.inf
+    cover_time = 0
     makespan = 0
     distance = 0
     for agent in range(world.n_agents):
         step = state.claim_steps[agent]
-        if step > 0:
+        cover_time = max(cover_time, step)
+        if world.return_home:
+            if world.table[state.cells[agent], HOME] > 0:
+                return np.inf, np.inf, np.inf
+            makespan = state.step[0]
+            distance += state.moved[agent]
+        elif step > 0:
             home = world.table[state.claim_cells[agent], HOME]
             makespan = max(makespan, step + home)
             distance += state.claim_moved[agent] + home
-    return float(state.step[0]), float(makespan), float(distance)
+    return float(cover_time), float(makespan), float(distance)

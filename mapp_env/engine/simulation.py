@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.engine.loops import step_and_observe
+from mapp_env.engine.options import Asked, check_options
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.scene import Scene
-from mapp_env.engine.sources import draw_problems
+from mapp_env.engine.sources import Source
 from mapp_env.engine.task import Task
-from mapp_env.problem import Problem
 
 FIRST_ROW = np.zeros(1, np.int64)
 VIEWS, MASKS = np.dtype(np.float32), np.dtype(np.int8)  # faster to pass than types
@@ -26,14 +27,23 @@ class Simulation:
 
     def __init__(self, task: Task, n_views: int) -> None:
         self.task = task
-        self.max_cycles = task.max_cycles  # of the episodes to come that do not bring their own
         self.running = False  # whether step() may be called
+        self._source = Source(task)
         self._rows = Rows(task, 1, n_views)
         self._limit = task.max_cycles
         self._views_shape, self._masks_shape = self._rows.views_shape, self._rows.masks_shape
         self._shape = (n_views, *task.view.shape)
         self._records = task.render_mode is not None
         self._bind()
+
+    @property
+    def max_cycles(self) -> int:
+        """Step limit of the episodes to come that do not bring their own."""
+        return self._rows.max_cycles
+
+    @max_cycles.setter
+    def max_cycles(self, value: int) -> None:
+        self._rows.max_cycles = value
 
     def _bind(self) -> None:
         """Gather what a step reads: to look it up would take longer than the step."""
@@ -44,17 +54,18 @@ class Simulation:
         self.__dict__.update(state)
         self._bind()
 
-    def reset(self, problem: Problem | None, np_random: np.random.Generator) -> None:
-        """Start an episode on ``problem``, or on one drawn with a single word of ``np_random``."""
-        self._limit = self.max_cycles
-        if problem is None:
+    def check_options(self, options: Mapping[str, Any] | None) -> Asked:
+        """Return what options ask for."""
+        return check_options(self._source, self.task, options)
+
+    def reset(self, asked: Asked, np_random: np.random.Generator) -> None:
+        """Start an episode as asked; what is drawn takes a single word of ``np_random``."""
+        problems = asked.problems
+        if problems is None:
             word = np_random.integers(2**64, dtype=np.uint64)
-            landmarks = draw_problems(self.task, np.array([word], np.uint64))
-        else:
-            if problem.max_cycles is not None:
-                self._limit = problem.max_cycles
-            landmarks = np.array([problem.landmarks], np.int32)
-        self._rows.start(FIRST_ROW, landmarks, self._limit)
+            problems = self._source.draw(np.array([word], np.uint64), asked.grids)
+        self._rows.start(FIRST_ROW, problems)
+        self._limit = int(self._rows.limits[0])
         self.running = True
 
     def step(
@@ -88,6 +99,11 @@ class Simulation:
         """Return the global observation (R9), shape (N + 2K,)."""
         state: NDArray[np.float32] = self._rows.state.head[0].astype(np.float32)
         return state
+
+    @property
+    def grid(self) -> int:
+        """Which of the task's grids the episode is on."""
+        return int(self._rows.state.grid[0, 0])
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success and the three costs of the episode (R8), inf if it was not solved."""

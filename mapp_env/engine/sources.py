@@ -1,132 +1,87 @@
-"""Where the next problem comes from: drawn on the task's grid, or given by whoever resets."""
+"""Where the next problem comes from if nobody gives one: it is drawn on the task's grids."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.task import Task
-from mapp_env.problem import Problem, check_landmarks, draw_landmarks
-from mapp_env.validation import describe
+from mapp_env.problem import LOW_32_BITS, draw_landmarks, scramble
+
+OWN_LIMIT = -1  # of an episode that has the environment's step limit
 
 
-def draw_problems(task: Task, words: NDArray[np.uint64]) -> NDArray[np.int32]:
-    """Return landmarks on the task's grid, shape (M, K), each row drawn with its random word."""
-    landmarks = np.empty((len(words), task.n_landmarks), np.int32)
-    _draw_rows(words, task.grid.reachable, landmarks)
-    return landmarks
+class Problems(NamedTuple):
+    """What M rows are started on."""
+
+    grids: NDArray[np.int64]  # (M,), numbers of the task's grids
+    landmarks: NDArray[np.int32]  # (M, K)
+    cells: NDArray[np.int32]  # (M, N), where the agents start
+    limits: NDArray[np.int64]  # (M,), step limits, or OWN_LIMIT
+
+    def take(self, rows: NDArray[np.int64]) -> Problems:
+        """Return those of some rows."""
+        grids, landmarks, cells, limits = self
+        return Problems(grids[rows], landmarks[rows], cells[rows], limits[rows])
+
+
+class Source:
+    """Draws the problems of a task."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+        rooms = [grid.reachable for grid in task.grids]
+        self._candidates = np.concatenate(rooms)
+        self._firsts = np.cumsum([0, *(len(room) for room in rooms)])
+        self._depots = np.array([grid.depot for grid in task.grids], np.int32)
+
+    def draw(self, words: NDArray[np.uint64], grids: NDArray[np.int64] | None = None) -> Problems:
+        """Return a problem for each random word, (M,), on a grid drawn with it, or on ``grids``."""
+        task, n_rows = self._task, len(words)
+        landmarks = np.empty((n_rows, task.n_landmarks), np.int32)
+        grids = np.full(n_rows, -1) if grids is None else grids.copy()
+        _draw_rows(words, self._firsts, self._candidates, grids, landmarks)
+        return self.place(grids, landmarks)
+
+    def place(self, grids: NDArray[np.int64], landmarks: NDArray[np.int32]) -> Problems:
+        """Return problems on landmarks, (M, K), of grids, (M,), in which all start on the depot."""
+        cells = np.repeat(self._depots[grids][:, None], self._task.n_agents, axis=1)
+        return Problems(grids, landmarks, cells, np.full(len(grids), OWN_LIMIT))
 
 
 @kernel
 def _draw_rows(
-    words: NDArray[np.uint64], candidates: NDArray[np.int32], landmarks: NDArray[np.int32]
+    words: NDArray[np.uint64],
+    firsts: NDArray[np.int64],
+    candidates: NDArray[np.int32],
+    grids: NDArray[np.int64],
+    landmarks: NDArray[np.int32],
 ) -> None:
+    """Draw a grid where it is negative, and landmarks; ``firsts`` (G + 1,) part the candidates."""
     for row, word in enumerate(words):
-        draw_landmarks(word, candidates, landmarks[row])
+        if grids[row] < 0:
+            grids[row] = draw_grid(word, firsts.shape[0] - 1)
+        first, end = firsts[grids[row]], firsts[grids[row] + 1]
+        draw_landmarks(word, candidates[first:end], landmarks[row])
 
 
-def check_options(task: Task, options: Mapping[str, Any] | None) -> Problem | None:
-    """Return the problem that ``reset(options=...)`` asks for, or ``None`` for a random one.
+@kernel
+def draw_grid(word: np.uint64, n_grids: int) -> int:
+    """Return one of ``n_grids`` numbers, each equally likely, by a random word (R10).
 
-    ``"landmarks"`` holds cells or (row, col) pairs, ``"problem"`` a whole problem on the task's
-    grid with as many agents and landmarks. Other keys are ignored.
-
-    Raises a ValueError if the options are invalid.
+    The word is scrambled as :func:`~mapp_env.problem.draw_landmarks` does it, which counts up from
+    0; here the count goes down from -1, so that the landmarks are what they are without a draw.
     """
-    if options is None:
-        return None
-    if not isinstance(options, Mapping):
-        raise ValueError(f"options must be a dict or None, got {describe(options)}")
-    problem, landmarks = options.get("problem"), options.get("landmarks")
-    if problem is None and landmarks is None:
-        return None
-    if problem is None:
-        cells = check_landmarks(task.grid, landmarks, task.n_landmarks, "options['landmarks']")
-        return Problem(task.grid, cells, task.n_agents)
-    if landmarks is not None:
-        raise ValueError("options must hold 'problem' or 'landmarks', got both")
-    if not isinstance(problem, Problem):
-        raise ValueError(f"options['problem'] must be a mapp_env.Problem, got {describe(problem)}")
-    wanted = (problem.grid, problem.n_agents, len(problem.landmarks))
-    if wanted != (task.grid, task.n_agents, task.n_landmarks):
-        raise ValueError(
-            f"options['problem'] must be on this environment's {task.grid!r} with "
-            f"{task.n_agents} agents and {task.n_landmarks} landmarks; got one on "
-            f"{problem.grid!r} with {problem.n_agents} and {len(problem.landmarks)}"
-        )
-    return problem
-
-
-def check_reset_mask(options: Mapping[str, Any] | None, n_rows: int) -> NDArray[np.bool_]:
-    """Return which rows of a batch to reset, shape (B,), the caller's array untouched.
-
-    Raises a ValueError if the options are not a dict, or their mask is invalid.
-    """
-    if options is not None and not isinstance(options, Mapping):
-        raise ValueError(f"options must be a dict or None, got {describe(options)}")
-    mask = None if options is None else options.get("reset_mask")
-    if mask is None:
-        return np.ones(n_rows, np.bool_)
-    valid = isinstance(mask, np.ndarray) and mask.dtype == np.bool_
-    if not valid or mask.shape != (n_rows,) or not mask.any():
-        raise ValueError(
-            f"options['reset_mask'] must be a bool array of shape ({n_rows},) with at "
-            f"least one True, got {describe(mask)}"
-        )
-    return np.array(mask, np.bool_)
-
-
-def check_problems(
-    task: Task, options: Mapping[str, Any] | None, n_rows: int
-) -> tuple[NDArray[np.int32] | None, int | None]:
-    """Return the landmarks that a batch is reset on, shape (B, K), and the step limit.
-
-    Both are None if nothing is asked for. Raises a ValueError if the options are invalid, or their
-    problem is not of the task's grid and sizes.
-    """
-    landmarks = None if options is None else options.get("landmarks")
-    if isinstance(landmarks, np.ndarray) and landmarks.ndim > 1:
-        rows, pairs = (n_rows, task.n_landmarks), (task.n_landmarks, 2)
-        if landmarks.shape not in (rows, (*rows, 2), pairs):
-            raise ValueError(
-                f"options['landmarks'] must be cells or (row, col) pairs, for each row {rows} or "
-                f"{(*rows, 2)}, for all {pairs}, got shape {landmarks.shape}"
-            )
-        if landmarks.shape == rows == pairs:
-            raise ValueError(
-                "options['landmarks'] of shape (2, 2) may mean cells for each of 2 rows or (row, "
-                "col) pairs for all: pass pairs for each row, shape (2, 2, 2), or a list of pairs"
-            )
-        if landmarks.shape != pairs:
-            return _check_rows(landmarks, task), None
-    problem = check_options(task, options)
-    if problem is None:
-        return None, None
-    cells = np.array(problem.landmarks, np.int32)
-    return np.repeat(cells[None], n_rows, axis=0), problem.max_cycles
-
-
-def _check_rows(landmarks: NDArray[Any], task: Task) -> NDArray[np.int32]:
-    """Return the landmarks of each row as cells, shape (B, K), if they satisfy rule R2.
-
-    They are given as cells, shape (B, K), or as (row, col) pairs, shape (B, K, 2).
-    """
-    grid, cells = task.grid, landmarks
-    ok = landmarks.dtype.kind in "iu"
-    if ok and landmarks.ndim == 3:
-        inside = ((landmarks >= 0) & (landmarks < grid.walls.shape)).all(axis=2)
-        cells = np.where(inside, landmarks[..., 0] * grid.cols + landmarks[..., 1], grid.depot)
-    if ok:
-        ordered = np.sort(cells, axis=1)
-        allowed = np.isin(cells, grid.reachable).all(axis=1)
-        distinct = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
-        ok = bool((allowed & distinct).all())
-    if not ok:
-        # Row by row, for the message that says which cell of which row is wrong and why.
-        for index, wanted in enumerate(landmarks):
-            check_landmarks(grid, wanted, name=f"options['landmarks'][{index}]")
-    return cells.astype(np.int32)
+    high = np.int64(word >> np.uint64(32))
+    low = np.int64(word & np.uint64(LOW_32_BITS))
+    used = 0
+    pick, multiple = 0, LOW_32_BITS
+    while multiple > LOW_32_BITS + 1 - n_grids:
+        used -= 1
+        bits = scramble(scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
+        pick = bits % n_grids
+        multiple = bits - pick
+    return int(pick)

@@ -2,7 +2,8 @@
 
 A row is one problem in progress, an int32 vector; its head is the paper's observation (R9), its
 tail what the metrics (R8) need. :class:`State` names its parts, and no other file knows where in
-the row they are. A world is what all rows have in common: sizes, kinds, and the tables of the grid.
+the row they are. A world is what all rows have in common: sizes, kinds, and the tables of the
+grids, one after the other; :func:`world_at` is what a single row sees of it.
 
 Cells and actions are used as ``uint32`` indices: a signed index costs a test for a negative one,
 which took a quarter of a batched step.
@@ -10,6 +11,7 @@ which took a quarter of a batched step.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +22,10 @@ from mapp_env.grid import Grid
 
 N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
 WAIT = 4
+MOVES, LANDMARKS = 0, 1  # what actions are: moves, or landmarks to walk towards (R11)
 ROW, COL, HOME, WALL, MASK = 5, 6, 7, 8, 9  # columns of a table, after the five moves
+
+FIRST, N_CELLS, DEPOT, WIDTH = 0, 1, 2, 3  # columns of a world's grids
 
 # Where the distances of a row's landmarks stand: from this line of `distances` on, or
 ALL_PAIRS = -1  # in `distances`, in the line of each landmark's cell
@@ -38,17 +43,20 @@ what Python hands to kernels; they begin with ``World(*world)``."""
 
 
 class World(NamedTuple):
-    """What the rules look up; :func:`mapp_env.engine.task.make_world` makes one."""
+    """What the rules look up; :func:`mapp_env.engine.world.make_world` makes one of G grids."""
 
     n_agents: int  # N
     n_landmarks: int  # K
     reward: int  # a Reward
     observation: int  # an Observation
-    table: NDArray[np.int32]  # (C, 10), from cell_table
+    actions: int  # MOVES or LANDMARKS
+    return_home: int  # 1 if the team walks home (R12), else 0
+    grids: NDArray[np.int32]  # (G, 4): first line in table, cells C, depot, columns of the widest
+    table: NDArray[np.int32]  # (sum of C, 10), from cell_table, grid after grid; cells are local
     distances: NDArray[np.int32]  # (S, C), from sources to cells: the reward's
     first_field: int  # line of the first landmark, ALL_PAIRS or BY_COORDINATES
-    view_distances: NDArray[np.int32]  # (S, C), the observation's
-    first_view_field: int  # line of the first landmark, or ALL_PAIRS
+    paths: NDArray[np.int32]  # (S, C), shortest paths: the observation's and the actions'
+    first_path: int  # line of the first landmark, or ALL_PAIRS
 
 
 class State(NamedTuple):
@@ -59,6 +67,7 @@ class State(NamedTuple):
     visited: NDArray[np.int32]  # (K,), 0 or 1
     head: NDArray[np.int32]  # (N + 2K,), the three together: the global observation (R9)
     step: NDArray[np.int32]  # (1,), steps since the reset
+    grid: NDArray[np.int32]  # (1,), which of the world's grids the episode is on
     moved: NDArray[np.int32]  # (N,), cells moved by each agent
     claim_cells: NDArray[np.int32]  # (N,), where each agent made its last claim
     claim_moved: NDArray[np.int32]  # (N,), cells it had moved by then
@@ -71,15 +80,16 @@ def state_length(n_agents: int, n_landmarks: int) -> int:
 
 
 def new_rows(n_rows: int, n_agents: int, n_landmarks: int) -> NDArray[np.int32]:
-    """Return B rows of zeros, shape (B, N + 2K + 1 + 4N)."""
-    return np.zeros((n_rows, state_length(n_agents, n_landmarks) + 1 + 4 * n_agents), np.int32)
+    """Return B rows of zeros, shape (B, N + 2K + 2 + 4N)."""
+    return np.zeros((n_rows, state_length(n_agents, n_landmarks) + 2 + 4 * n_agents), np.int32)
 
 
 def split(rows: NDArray[Any], n_agents: int, n_landmarks: int) -> State:
     """Return the parts of a row, or of many rows, last axis first to last entry."""
     visited = n_agents + n_landmarks
     step = visited + n_landmarks
-    moved = step + 1
+    grid = step + 1
+    moved = grid + 1
     claim_cells = moved + n_agents
     claim_moved = claim_cells + n_agents
     claim_steps = claim_moved + n_agents
@@ -88,7 +98,8 @@ def split(rows: NDArray[Any], n_agents: int, n_landmarks: int) -> State:
         landmarks=rows[..., n_agents:visited],
         visited=rows[..., visited:step],
         head=rows[..., :step],
-        step=rows[..., step:moved],
+        step=rows[..., step:grid],
+        grid=rows[..., grid:moved],
         moved=rows[..., moved:claim_cells],
         claim_cells=rows[..., claim_cells:claim_moved],
         claim_moved=rows[..., claim_moved:claim_steps],
@@ -101,19 +112,30 @@ split_row = kernel(split)
 
 
 @kernel
-def world_at(world: World, index: int) -> World:
-    """Return the world as the row of this number sees it: distance fields hold K lines a row."""
-    first, first_view = world.first_field, world.first_view_field
+def world_at(world: World, row: NDArray[np.int32], index: int) -> World:
+    """Return the world as a row sees it: its own grid alone, and its own K lines of fields.
+
+    ``index`` is the row's number among those that fields are kept for.
+    """
+    grids, table = world.grids, world.table
+    if grids.shape[0] > 1:
+        which = split_row(row, world.n_agents, world.n_landmarks).grid[0]
+        grids = grids[which : which + 1]
+        table = table[grids[0, FIRST] : grids[0, FIRST] + grids[0, N_CELLS]]
+    first, first_path = world.first_field, world.first_path
     return World(
         world.n_agents,
         world.n_landmarks,
         world.reward,
         world.observation,
-        world.table,
+        world.actions,
+        world.return_home,
+        grids,
+        table,
         world.distances,
         first if first < 0 else index * world.n_landmarks,
-        world.view_distances,
-        first_view if first_view < 0 else index * world.n_landmarks,
+        world.paths,
+        first_path if first_path < 0 else index * world.n_landmarks,
     )
 
 
@@ -125,12 +147,23 @@ def landmark_source(state: State, landmark: int, first_field: int) -> int:
     return first_field + landmark
 
 
-def path_distances(grid: Grid, fields: NDArray[np.int32]) -> tuple[NDArray[np.int32], int]:
+@kernel
+def direct_steps(table: NDArray[np.int32], start: int, end: int) -> int:
+    """Return the Manhattan distance between two cells of a grid with this table."""
+    a, b = np.uint32(start), np.uint32(end)
+    return int(abs(table[a, ROW] - table[b, ROW]) + abs(table[a, COL] - table[b, COL]))
+
+
+def path_distances(
+    grids: Sequence[Grid], fields: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], int]:
     """Return shortest paths as a world holds them: of all pairs, or the rows' fields if it has any.
 
-    Raises a ValueError if there are no fields and the grid is too large for all pairs.
+    Raises a ValueError if there are no fields and the grid, which must be a single one then, is too
+    large for all pairs.
     """
     if not fields.size:
+        (grid,) = grids
         return grid.distances, ALL_PAIRS
     lines = fields.view()
     lines.flags.writeable = False

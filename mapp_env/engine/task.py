@@ -1,43 +1,40 @@
-"""A task: everything an environment is told when it is made, validated, and the tables it needs."""
+"""A task: everything an environment is told when it is made, validated."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import dataclass, fields
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.engine.observation import PATH_OBSERVATIONS, Observation, View, view, view_distances
-from mapp_env.engine.rules import PATH_REWARDS, Reward, reward_distances
-from mapp_env.engine.state import N_ACTIONS, NO_DISTANCES, World, cell_table
+from mapp_env.engine.observation import Observation, View, view
+from mapp_env.engine.rules import Reward
+from mapp_env.engine.state import N_ACTIONS, World
+from mapp_env.engine.world import make_world, needs_paths
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS, Grid
-from mapp_env.grids import find_grid
+from mapp_env.grids import find_grids
 from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, MAX_LANDMARKS, check_grid
 from mapp_env.validation import check_choice, check_count, check_flag
 
 RENDER_MODES = ("human", "rgb_array", "ansi")
+ACTIONS = ("moves", "landmarks")  # in the order of state.MOVES and state.LANDMARKS
 
 MAX_BYTES = 1 << 30
-"""Largest array of one kind (observations, distance fields) that an environment may need."""
+"""Largest array of one kind (tables, observations, paths) that an environment may need."""
+
+TABLE_BYTES = 40  # of a cell in a world's table
 
 
 class GridLike:
-    """A field that is given a grid, its name or its path, and holds the grid."""
+    """A field that is given a grid, its name, its path or a pool, and holds a grid or a tuple."""
 
-    @overload
-    def __get__(self, task: None, owner: type) -> str: ...
-
-    @overload
-    def __get__(self, task: Task, owner: type) -> Grid: ...
-
-    def __get__(self, task: Task | None, owner: type) -> str | Grid:
+    def __get__(self, task: Task | None, owner: type) -> Any:
         return "paper-7x7" if task is None else task.__dict__["grid"]
 
-    def __set__(self, task: Task, grid: str | os.PathLike[str] | Grid) -> None:
-        task.__dict__["grid"] = find_grid(grid)
+    def __set__(self, task: Task, grid: object) -> None:
+        task.__dict__["grid"] = find_grids(grid)
 
 
 @dataclass(frozen=True)
@@ -58,6 +55,9 @@ class Task:
     observation: str = "global"
     allow_wait: bool = False
     render_mode: str | None = None
+    _: KW_ONLY
+    actions: str = "moves"
+    return_home: bool = False
 
     def __post_init__(self) -> None:
         values = {
@@ -68,16 +68,30 @@ class Task:
             "observation": check_choice("observation", self.observation, _names(Observation)),
             "allow_wait": check_flag("allow_wait", self.allow_wait),
             "render_mode": check_choice("render_mode", self.render_mode, (None, *RENDER_MODES)),
+            "actions": check_choice("actions", self.actions, ACTIONS),
+            "return_home": check_flag("return_home", self.return_home),
         }
-        check_grid("grid", self.grid)
         for name, value in values.items():
             object.__setattr__(self, name, value)
-        room = self.grid.reachable.size
-        if self.n_landmarks > room:
+        if self.allow_wait and self.actions == "landmarks":
             raise ValueError(
-                f"n_landmarks must be at most {room}, the cells of {self.grid!r} that can be "
-                f"reached from its depot; got {self.n_landmarks}"
+                "allow_wait must be False with actions='landmarks', where the last action is to "
+                "stay (with return_home: to walk home); got True"
             )
+        size = TABLE_BYTES * sum(grid.n_cells for grid in self.grids)
+        if size > MAX_BYTES:
+            raise ValueError(
+                f"grid: tables of {len(self.grids)} grid(s) would take {size} bytes, allowed are "
+                f"{MAX_BYTES}"
+            )
+        for index, grid in enumerate(self.grids):
+            name = f"grid[{index}]" if self.is_pool else "grid"
+            room = check_grid(name, grid).reachable.size
+            if self.n_landmarks > room:
+                raise ValueError(
+                    f"n_landmarks must be at most {room}, the cells of {name}, {grid!r}, that can "
+                    f"be reached from its depot; got {self.n_landmarks}"
+                )
         self.check_memory(1)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -92,9 +106,35 @@ class Task:
     # -- what follows from the arguments -----------------------------------------------
 
     @property
+    def is_pool(self) -> bool:
+        """Whether each episode draws its grid (R10), be it of one only."""
+        return isinstance(self.grid, tuple)
+
+    @property
+    def grids(self) -> tuple[Grid, ...]:
+        """The grids that episodes are on: one, or those of the pool."""
+        return self.grid if self.is_pool else (self.grid,)
+
+    @cached_property
+    def numbers(self) -> dict[Grid, int]:
+        """The number of each grid; of equal ones the first."""
+        return {grid: index for index, grid in reversed(list(enumerate(self.grids)))}
+
+    @cached_property
+    def largest(self) -> int:
+        """Number of cells of the largest grid."""
+        return max(grid.n_cells for grid in self.grids)
+
+    @property
+    def action_kind(self) -> int:
+        """What actions are, as the kernels know it."""
+        return ACTIONS.index(self.actions)
+
+    @property
     def n_actions(self) -> int:
-        """Number of actions an agent has: 4, or 5 with waiting."""
-        return N_ACTIONS + self.allow_wait
+        """Number of actions an agent has: 4, or 5 with waiting; or one more than landmarks."""
+        moves = N_ACTIONS + self.allow_wait
+        return moves if self.actions == "moves" else self.n_landmarks + 1
 
     @property
     def reward_kind(self) -> Reward:
@@ -109,12 +149,12 @@ class Task:
     @cached_property
     def view(self) -> View:
         """Shape and bounds of one agent's observation."""
-        return view(self.observation_kind, self.grid, self.n_agents, self.n_landmarks)
+        return view(self.observation_kind, self.grids, self.n_agents, self.n_landmarks)
 
     @cached_property
     def state_view(self) -> View:
         """Shape and bounds of the global observation."""
-        return view(Observation.GLOBAL, self.grid, self.n_agents, self.n_landmarks)
+        return view(Observation.GLOBAL, self.grids, self.n_agents, self.n_landmarks)
 
     @cached_property
     def central_view(self) -> View:
@@ -127,14 +167,22 @@ class Task:
 
     @property
     def needs_fields(self) -> bool:
-        """Whether paths are kept for each landmark, the grid being too large for all pairs."""
-        wanted = self.reward_kind in PATH_REWARDS or self.observation_kind in PATH_OBSERVATIONS
-        return wanted and self.grid.n_cells > MAX_ALL_PAIRS_CELLS
+        """Whether paths are kept for each landmark, the grids being too many for all pairs."""
+        few = len(self.grids) == 1 and self.largest <= MAX_ALL_PAIRS_CELLS
+        return not few and needs_paths(self.reward_kind, self.observation_kind, self.action_kind)
 
     def world(self, fields: NDArray[np.int32]) -> World:
         """Return what the kernels look up; ``fields`` as in :func:`make_world`."""
-        sizes = self.n_agents, self.n_landmarks
-        return make_world(self.grid, *sizes, self.reward_kind, self.observation_kind, fields)
+        return make_world(
+            self.grids,
+            self.n_agents,
+            self.n_landmarks,
+            self.reward_kind,
+            self.observation_kind,
+            fields,
+            self.action_kind,
+            self.return_home,
+        )
 
     def check_memory(self, n_rows: int, n_joint_actions: int = 0) -> None:
         """Check that the arrays for a number of rows fit in memory.
@@ -147,7 +195,7 @@ class Task:
         if size > MAX_BYTES:
             raise ValueError(
                 f"observation={self.observation!r} of {n_rows} environment(s) with {self.n_agents} "
-                f"agents on {self.grid!r} would take {size} bytes a step, allowed are {MAX_BYTES}"
+                f"agents on {self._where} would take {size} bytes a step, allowed are {MAX_BYTES}"
             )
         if n_rows * n_joint_actions > MAX_BYTES:
             raise ValueError(
@@ -155,37 +203,19 @@ class Task:
                 f"would take {n_rows * n_joint_actions} bytes a step, allowed are {MAX_BYTES}: "
                 "use 'multi'"
             )
-        size = 4 * n_rows * self.n_landmarks * self.grid.n_cells
+        size = 4 * n_rows * self.n_landmarks * self.largest
         if self.needs_fields and size > MAX_BYTES:
             raise ValueError(
                 f"geodesic distances of {n_rows} environment(s) with {self.n_landmarks} landmarks "
-                f"on {self.grid!r} would take {size} bytes, allowed are {MAX_BYTES}"
+                f"on {self._where} would take {size} bytes, allowed are {MAX_BYTES}"
             )
 
-
-def make_world(
-    grid: Grid,
-    n_agents: int,
-    n_landmarks: int,
-    reward: Reward = Reward.STEP,
-    observation: Observation = Observation.GLOBAL,
-    fields: NDArray[np.int32] = NO_DISTANCES[:0],
-) -> World:
-    """Return what the rules look up on a grid; sizes are not checked here.
-
-    ``fields``, shape (B * K, C), is where shortest paths from the rows' landmarks will stand; if it
-    is empty, those of all pairs do. Raises a ValueError if shortest paths are looked up, without
-    fields, on a grid too large for all pairs.
-    """
-    return World(
-        n_agents,
-        n_landmarks,
-        int(reward),
-        int(observation),
-        cell_table(grid),
-        *reward_distances(reward, grid, fields),
-        *view_distances(observation, grid, fields),
-    )
+    @property
+    def _where(self) -> str:
+        """The grids, for messages."""
+        if not self.is_pool:
+            return repr(self.grid)
+        return f"{len(self.grids)} grids of up to {self.largest} cells"
 
 
 def _names(kinds: type[Reward] | type[Observation]) -> tuple[str, ...]:

@@ -25,7 +25,8 @@ def central_action_space(
     """Return the meta-agent's action space and, for numbered joint actions, their table.
 
     The table, shape (A**N, N), holds each agent's action for each joint action, the first agent
-    most significant. Raises a ValueError if joint actions are asked for more than six agents.
+    most significant. Raises a ValueError if joint actions are asked for more than six agents, or
+    for landmarks.
     """
     n_agents, n_actions, central_action = task.n_agents, task.n_actions, task.central_action
     if central_action == "joint" and n_agents > MAX_JOINT_AGENTS:
@@ -33,7 +34,11 @@ def central_action_space(
             f"central_action='joint' is for at most {MAX_JOINT_AGENTS} agents, got n_agents="
             f"{n_agents}: use 'multi'"
         )
-    if central_action == "multi" or n_agents > MAX_JOINT_AGENTS:
+    if central_action == "joint" and task.actions == "landmarks":
+        raise ValueError(
+            "central_action='joint' is for actions='moves', got actions='landmarks': use 'multi'"
+        )
+    if central_action == "multi" or n_agents > MAX_JOINT_AGENTS or task.actions == "landmarks":
         return MultiDiscrete(np.full(n_agents, n_actions)), None
     table = np.indices((n_actions,) * n_agents).reshape(n_agents, -1).T
     return Discrete(n_actions**n_agents), np.ascontiguousarray(table, np.int64)
@@ -70,8 +75,10 @@ class CentralEnv(SimulationEnv):
     ----------
     central_action : {"auto", "joint", "multi"}
         ``"joint"``: ``Discrete(A**N)``, the first agent most significant; ``"multi"``:
-        ``MultiDiscrete``, one action an agent; ``"auto"``: joint up to six agents.
+        ``MultiDiscrete``, one action an agent; ``"auto"``: joint up to six agents, unless actions
+        are landmarks.
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
+    actions, return_home
         As in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
     Raises
@@ -131,11 +138,12 @@ class CentralEnv(SimulationEnv):
 
     def _find_info(self, masks: NDArray[np.int8]) -> dict[str, Any]:
         """Return the info of a moment in which the agents have these masks, shape (N, A)."""
-        if self._joint_actions is None:
-            return {"action_mask": masks}
-        joint = np.empty(len(self._joint_actions), np.int8)
-        fill_joint_mask(masks, joint)
-        return {"action_mask": masks, "joint_action_mask": joint}
+        info: dict[str, Any] = {"action_mask": masks}
+        if self._joint_actions is not None:
+            info["joint_action_mask"] = np.empty(len(self._joint_actions), np.int8)
+            fill_joint_mask(masks, info["joint_action_mask"])
+        self._name_grid(info)
+        return info
 
     def _read_action(self, action: Any) -> NDArray[np.int64]:
         """Return each agent's action, shape (N,)."""

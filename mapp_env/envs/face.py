@@ -13,7 +13,6 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from mapp_env.engine.simulation import Simulation
-from mapp_env.engine.sources import check_options
 from mapp_env.engine.task import RENDER_MODES, Task
 from mapp_env.problem import MAX_CYCLES
 from mapp_env.rendering.display import Display
@@ -64,14 +63,19 @@ class Face:
         """Start an episode; return views, shape (V, ...), and action masks, shape (N, A)."""
         if seed is not None:
             seed = check_count("seed", seed, 0, MAX_SEED)
-        problem = check_options(self.task, options)
+        asked = self._simulation.check_options(options)
         if seed is not None:
             self._np_random, self._np_random_seed = seeding.np_random(seed)
-        self._simulation.reset(problem, self.np_random)
+        self._simulation.reset(asked, self.np_random)
         self._started = True
         if self.render_mode == "human":
             self.render()
         return self._simulation.observe()
+
+    def _name_grid(self, info: dict[str, Any]) -> None:
+        """Add to an info, in an environment with a pool, which of its grids the episode is on."""
+        if self.task.is_pool:
+            info["grid"] = self._simulation.grid
 
     def render(self) -> Any:
         """Show the episode as ``render_mode`` says.

@@ -31,8 +31,9 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
 
     Parameters
     ----------
-    grid : str, os.PathLike or Grid
-        A bundled name, a path to a text or MovingAI ``.map`` file, or a grid.
+    grid : str, os.PathLike, Grid or sequence of Grid
+        A bundled name, a path to a text or MovingAI ``.map`` file, or a grid. Of several grids, a
+        pool, each episode draws one (R10).
     n_agents : int
         1 to 16.
     n_landmarks : int
@@ -43,12 +44,18 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
     reward : {"manhattan", "geodesic", "step"}
         Team reward: minus the sum over unvisited landmarks of the nearest agent's distance, by
         Manhattan distance (the paper's) or shortest path; or -1 a step.
-    observation : {"global", "own_first", "planes", "geodesic"}
+    observation : {"global", "own_first", "planes", "geodesic", "distances"}
         See :mod:`mapp_env.engine.observation`.
     allow_wait : bool
         Whether there is a fifth action, to wait.
     render_mode : {None, "human", "rgb_array", "ansi"}
         How :meth:`render` shows the episode; "human" draws at every step by itself.
+    actions : {"moves", "landmarks"}
+        What an action is: a move, or the number of a landmark to walk one step towards on a
+        shortest path, one more than there are landmarks to stay (R11).
+    return_home : bool
+        Whether the episode goes on until all agents are back on the depot (R12); the last landmark
+        action is then to walk home.
 
     Raises
     ------
@@ -76,6 +83,7 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
         self._numbered = tuple(enumerate(self._names))
         self._flags = {flag: dict.fromkeys(self._names, flag) for flag in (False, True)}
         self._n_actions = task.n_actions
+        self._is_pool = task.is_pool
         self._actions = np.zeros(task.n_agents, np.int64)
 
     def observation_space(self, agent: AgentID) -> Box:
@@ -98,13 +106,15 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
             operating system's entropy at first).
         options : dict, optional
             ``{"landmarks": cells or (row, col) pairs}`` or ``{"problem": Problem}`` fixes the
-            problem, and draws nothing from the generator. Other keys are ignored.
+            problem, and draws nothing from the generator. With a pool, ``"grid"`` is the number of
+            the grid that landmarks are on, given or drawn. Other keys are ignored.
 
         Returns
         -------
         observations, infos : dict
             By agent; ``infos[agent]["action_mask"]`` is int8, shape (A,): 0 for a move that would
-            bump. A bump is allowed: the mask is advice.
+            bump, or a landmark that is visited. The mask is advice: both are allowed. With a pool,
+            ``infos[agent]["grid"]`` is the number of the episode's grid.
 
         Raises
         ------
@@ -124,7 +134,8 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
         ----------
         actions : dict
             An action for each agent: 0 left, 1 right, 2 up, 3 down and, with ``allow_wait``,
-            4 wait. After the end of an episode an empty dict is accepted and gives empty dicts.
+            4 wait; or, with ``actions="landmarks"``, 0 to K. After the end of an episode an empty
+            dict is accepted and gives empty dicts.
 
         Returns
         -------
@@ -167,6 +178,9 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
         for index, name in self._numbered:
             observations[name] = views[index]
             infos[name] = {"action_mask": masks[index]}
+        if self._is_pool:
+            for info in infos.values():
+                self._name_grid(info)
         return observations, infos
 
     def _read_actions(self, actions: Mapping[AgentID, int]) -> None:

@@ -21,11 +21,13 @@ class TupleEnv(SimulationEnv):
     Observations and actions are tuples with an entry an agent, rewards a list with the team reward
     for each, that of the last step included; ``terminated`` and ``truncated`` are of the team.
     Infos are empty but for the last step's: such trainers sum what they find there, so it holds
-    one number, ``success`` (0 or 1). Masks, costs and the state are attributes.
+    one number, ``success`` (0 or 1). Masks, costs, the state and which grid of a pool the episode
+    is on are attributes.
 
     Parameters
     ----------
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
+    actions, return_home
         As in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
     Attributes
@@ -33,7 +35,9 @@ class TupleEnv(SimulationEnv):
     n_agents : int
         Agents N.
     action_masks : ndarray of int8, shape (N, A)
-        Of the present moment: 0 for a move that would bump.
+        Of the present moment: 0 for a move that would bump, or a landmark that is visited.
+    grid : int
+        Number of the episode's grid in the pool.
 
     Raises
     ------
@@ -88,6 +92,11 @@ class TupleEnv(SimulationEnv):
         reward, terminated, truncated, views, self.action_masks = self._play(action)
         info = {"success": float(terminated)} if terminated or truncated else {}
         return tuple(views), [reward] * self.n_agents, terminated, truncated, info
+
+    @property
+    def grid(self) -> int:
+        """Number of the episode's grid in the pool; 0 without one."""
+        return self._simulation.grid
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success, cover_time, makespan and total_distance of the episode so far.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 
 from mapp_env.engine.loops import find_bad_action
 from mapp_env.engine.observation import Observation
+from mapp_env.engine.options import check_options, check_problems, check_reset_mask
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
-from mapp_env.engine.sources import check_problems, check_reset_mask, draw_problems
+from mapp_env.engine.sources import OWN_LIMIT, Source
 from mapp_env.engine.task import Task
 from mapp_env.envs.arguments import BATCH_RENDER_MODES, AutoresetMode, BatchTask, takes
 from mapp_env.envs.central_env import CentralEnv, central_action_space
 from mapp_env.envs.vector_infos import Transition, add_joint_masks, make_infos
-from mapp_env.problem import MAX_CYCLES
+from mapp_env.problem import MAX_CYCLES, Problem
 from mapp_env.rendering.display import Display
 from mapp_env.validation import as_array, check_count
 
@@ -45,6 +46,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     central_action : {"multi", "joint", "auto"}
         Actions of shape (B, N), one per agent, or (B,), numbered joint actions.
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
+    actions, return_home
         As in :class:`mapp_env.envs.parallel_env.MappParallelEnv`.
 
     Attributes
@@ -78,6 +80,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         n_views = 1 if task.observation_kind == Observation.GLOBAL else task.n_agents
+        self._source = Source(task)
         self._rows = Rows(task, self.num_envs, n_views)
         self._observations_shape = self.observation_space.shape
         self._seeds = RowSeeds(self.num_envs)
@@ -125,9 +128,10 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             An int is spread over the rows, see :meth:`mapp_env.engine.seeds.RowSeeds.seed`; a
             sequence seeds each row, but those of ``None``.
         options : dict, optional
-            ``"reset_mask"``: bool, shape (B,). ``"landmarks"`` or ``"problem"``: as in the single
-            environment, for all rows alike; or the landmarks of each row as an int array of cells,
-            shape (B, K), or of (row, col) pairs, shape (B, K, 2). Other keys are ignored.
+            ``"reset_mask"``: bool, shape (B,). ``"landmarks"``, ``"grid"`` or ``"problem"``: as in
+            the single environment, for all rows alike; or for each row: an int array of landmarks'
+            cells, shape (B, K), or of (row, col) pairs, shape (B, K, 2); the numbers of grids,
+            shape (B,); a sequence of B problems. Other keys are ignored.
 
         Returns
         -------
@@ -145,13 +149,13 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         mask = check_reset_mask(options, self.num_envs)
         if not self._started and not mask.all():
             raise ValueError("options['reset_mask'] must be all True in the first reset")
-        landmarks, limit = check_problems(self.task, options, self.num_envs)
+        asked = check_problems(self._source, self.task, options, self.num_envs)
         indices = np.flatnonzero(mask)
         self._seeds.seed(seeds, indices.tolist())
-        if landmarks is None:
-            self._draw(indices)
+        if asked.problems is not None:
+            self._rows.start(indices, asked.problems.take(indices))
         else:
-            self._rows.start(indices, landmarks[indices], limit)
+            self._draw(indices, None if asked.grids is None else asked.grids[indices])
         self._ended[indices] = False
         self._started = True
         views, action_mask = self._rows.observe()
@@ -159,6 +163,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         infos = {"action_mask": action_mask, "_action_mask": mask}
         if self._n_joint_actions:
             add_joint_masks(infos, self._n_joint_actions)
+        if self.task.is_pool:
+            infos["grid"], infos["_grid"] = np.where(mask, self._grids(), 0), mask.copy()
         return views.reshape(self._observations_shape), infos
 
     def step(
@@ -224,6 +230,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         restarted = mode == AutoresetMode.SAME_STEP
         # With few rows most steps end none, and looking for them takes longest.
         endings = self._no_endings
+        grids = self._grids() if self.task.is_pool else None
         if len(ended):
             last = observations.take(ended, axis=0), masks.take(ended, axis=0)
             endings = (self._rows.measure(ended), *last)
@@ -231,11 +238,36 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 self._draw(ended)
                 self._rows.observe_again(ended, views, masks)
         found = observations, rewards, terminations, truncations, masks, self._ended.copy(), ended
-        return Transition(*found, *endings, restarted)
+        played = grids, self._grids() if restarted and self.task.is_pool else grids
+        return Transition(*found, *endings, restarted, *played)
 
-    def _draw(self, indices: NDArray[np.int64]) -> None:
-        """Start an episode on a random problem in some rows."""
-        self._rows.start(indices, draw_problems(self.task, self._seeds.next_words(indices)))
+    def _grids(self) -> NDArray[np.int64]:
+        """Return the number of each row's grid, shape (B,)."""
+        return self._rows.state.grid[:, 0].astype(np.int64)
+
+    def find_problem(self, options: Mapping[str, Any]) -> Problem | None:
+        """Return the problem that options of a single environment fix, or ``None``.
+
+        Raises
+        ------
+        ValueError
+            If the options cannot be used.
+        """
+        problems = check_options(self._source, self.task, options).problems
+        if problems is None:
+            return None
+        limit = int(problems.limits[0])
+        return Problem(
+            self.task.grids[problems.grids[0]],
+            tuple(problems.landmarks[0].tolist()),
+            self.task.n_agents,
+            None if limit == OWN_LIMIT else limit,
+            tuple(problems.cells[0].tolist()),
+        )
+
+    def _draw(self, indices: NDArray[np.int64], grids: NDArray[np.int64] | None = None) -> None:
+        """Start an episode on a random problem in some rows, (M,), on given grids or any."""
+        self._rows.start(indices, self._source.draw(self._seeds.next_words(indices), grids))
 
     def _read_actions(self, actions: Any) -> NDArray[np.int64]:
         """Return each agent's action in each row, shape (B, N)."""

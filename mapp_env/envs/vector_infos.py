@@ -24,6 +24,8 @@ class Transition(NamedTuple):
     last_observations: NDArray[np.float32]  # (M, ...)
     last_masks: NDArray[np.int8]  # (M, N, A)
     restarted: bool  # whether the rows of ended have begun their next episode
+    played_grids: NDArray[np.int64] | None  # (B,), of the pool: where the step was; None without
+    grids: NDArray[np.int64] | None  # (B,), of the next episode in rows that restarted
 
 
 def make_infos(transition: Transition, n_joint_actions: int) -> dict[str, Any]:
@@ -40,6 +42,8 @@ def make_infos(transition: Transition, n_joint_actions: int) -> dict[str, Any]:
     infos["_action_mask"] = np.ones(len(transition.dones), np.bool_)
     if n_joint_actions:
         add_joint_masks(infos, n_joint_actions)
+    if transition.grids is not None:
+        infos["grid"], infos["_grid"] = transition.grids, np.ones(len(transition.dones), np.bool_)
     return infos
 
 
@@ -74,6 +78,9 @@ def _add_finals(infos: dict[str, Any], transition: Transition, n_joint_actions: 
     final_info = {"action_mask": action_mask, "_action_mask": dones.copy()}
     if n_joint_actions:
         add_joint_masks(final_info, n_joint_actions)
+    if transition.played_grids is not None:
+        final_info["grid"] = np.where(dones, transition.played_grids, 0)
+        final_info["_grid"] = dones.copy()
     _add_metrics(final_info, transition)
     infos["final_obs"], infos["_final_obs"] = final_obs, dones.copy()
     infos["final_info"], infos["_final_info"] = final_info, dones.copy()

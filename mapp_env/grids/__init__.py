@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -13,7 +13,7 @@ from mapp_env.grid import Grid
 from mapp_env.grids.generators import GENERATORS
 from mapp_env.validation import check_choice, describe
 
-__all__ = ["find_grid", "generator_names", "grid_names", "make_grid"]
+__all__ = ["find_grid", "find_grids", "generator_names", "grid_names", "make_grid"]
 
 
 @cache
@@ -97,3 +97,22 @@ def find_grid(grid: object) -> Grid:
         f"grid must be a mapp_env.Grid, a bundled name ({', '.join(grid_names())}) or a path to a "
         f"map file; got {describe(grid, 320)}{missing}"
     )
+
+
+def find_grids(grid: object) -> Grid | tuple[Grid, ...]:
+    """Return the grid meant as in :func:`find_grid`, or the grids of a pool, a sequence of them.
+
+    Raises a ValueError if ``grid`` is neither, or a pool has no grids or something else among them.
+    """
+    if not isinstance(grid, Sequence) or isinstance(grid, str | bytes):
+        return find_grid(grid)
+    if not grid:
+        raise ValueError("grid must be a grid, or a sequence of at least one, got none")
+    for index, each in enumerate(grid):
+        # As text, in a dict, a grid is in the JSON of an environment's spec.
+        if not isinstance(each, Grid | Mapping):
+            raise ValueError(
+                f"grid[{index}] must be a mapp_env.Grid, as make_grid(), make_grids(), "
+                f"load_grids() and Grid.load() return it; got {describe(each)}"
+            )
+    return tuple(map(find_grid, grid))

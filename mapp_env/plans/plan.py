@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.engine.state import WAIT
 from mapp_env.files import FileError
-from mapp_env.plans.replay import Episode, check_joint_actions, play_episode
+from mapp_env.plans.replay import Episode, play_episode
 from mapp_env.plans.tours import check_tours, moves_of, tour_of, walk_tours
-from mapp_env.problem import MAX_CYCLES, Problem
+from mapp_env.problem import MAX_CYCLES, Problem, check_joint_actions
 from mapp_env.records import MAX_INTEGER, MAX_PLAN_BYTES, Record, read_record, write_record
 from mapp_env.validation import as_real, check_choice, check_count, describe
 

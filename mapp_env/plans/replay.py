@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.rules import measure_row, reset_row, step_row
-from mapp_env.engine.state import WAIT, Packed, World, new_rows, split_row
-from mapp_env.engine.task import make_world
+from mapp_env.engine.state import Packed, World, new_rows, split_row
+from mapp_env.engine.world import make_world
 from mapp_env.grid import Grid
 from mapp_env.problem import Problem
-from mapp_env.validation import as_array, describe
 
 
 class Episode(NamedTuple):
@@ -33,8 +32,8 @@ class Episode(NamedTuple):
 def play_episode(problem: Problem, actions: NDArray[np.int64]) -> Episode:
     """Carry out joint actions, shape (T, N), until every landmark is visited or the step limit.
 
-    The limit is the problem's, if it has one; actions are as :func:`check_joint_actions` says. The
-    last episode is kept: checking, saving and drawing a plan play the same actions.
+    The limit is the problem's, if it has one; actions are checked. The last episode is kept:
+    checking, saving and drawing a plan play the same actions.
     """
     return _play(problem, actions.tobytes())
 
@@ -47,8 +46,9 @@ def _play(problem: Problem, data: bytes) -> Episode:
     n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
     world = make_world(problem.grid, n_agents, n_landmarks)
     row = new_rows(1, n_agents, n_landmarks)[0]
-    reset_row(row, np.array(problem.landmarks, np.int32), problem.grid.depot, world)
-    cells = np.full((len(actions) + 1, n_agents), problem.grid.depot, np.int32)
+    cells = np.empty((len(actions) + 1, n_agents), np.int32)
+    cells[0] = problem.start_cells
+    reset_row(row, np.array(problem.landmarks, np.int32), cells[0], world)
     visits = np.zeros(n_landmarks, np.int64)
     steps = play_row(row, actions, cells, visits, tuple(world))
     claims: list[list[int]] = [[] for _ in range(n_agents)]
@@ -104,25 +104,3 @@ def play_row(
         if terminated:
             return step
     return len(actions)
-
-
-def check_joint_actions(joint_actions: Any, n_agents: int) -> NDArray[np.int64]:
-    """Return joint actions as an int64 array of shape (T, N).
-
-    Raises a ValueError if the shape is wrong or an action is not one.
-    """
-    array = as_array(joint_actions)
-    if array.shape in ((0,), (0, n_agents)):
-        return np.empty((0, n_agents), np.int64)
-    if array.ndim != 2 or array.shape[1] != n_agents or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"joint_actions must be integers of shape (T, {n_agents}), "
-            f"got {describe(joint_actions)}"
-        )
-    wrong = np.argwhere((array < 0) | (array > WAIT))
-    if len(wrong):
-        step, agent = wrong[0].tolist()
-        raise ValueError(
-            f"joint_actions[{step}, {agent}] must be in 0..{WAIT}, got {array[step, agent]}"
-        )
-    return np.ascontiguousarray(array, np.int64)

@@ -143,7 +143,8 @@ def scenes(problem: Problem, actions: tuple[tuple[int, ...], ...]) -> Iterator[S
         render_mode="rgb_array",
     )
     simulation = Simulation(task, 1)
-    simulation.reset(problem, np.random.default_rng(0))
+    asked = simulation.check_options({"problem": problem})
+    simulation.reset(asked, np.random.default_rng(0))
     yield simulation.scene()
     for joint_action in actions:
         simulation.step(np.array(joint_action, np.int64))

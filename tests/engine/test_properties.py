@@ -22,7 +22,7 @@ import mapp_env
 from mapp_env import mapp_v0
 from mapp_env.engine.loops import visit_rows
 from mapp_env.engine.rules import Reward
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

@@ -21,9 +21,10 @@ from model import OBSERVATIONS, REWARDS
 
 import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.engine.options import NOTHING
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.simulation import Simulation
-from mapp_env.engine.sources import draw_problems
+from mapp_env.engine.sources import Source
 from mapp_env.engine.task import Task
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -598,9 +599,9 @@ def test_no_action_reaches_the_rules_unseen(allow_wait: bool, same: Any) -> None
     batches = [Rows(task, 2, 1) for _ in range(2)]
     nobody = np.zeros(2, bool)
     for simulation in simulations:
-        simulation.reset(None, np.random.default_rng(0))
+        simulation.reset(NOTHING, np.random.default_rng(0))
     for rows in batches:
-        rows.start(np.arange(2), draw_problems(task, np.array([1, 2], np.uint64)))
+        rows.start(np.arange(2), Source(task).draw(np.array([1, 2], np.uint64)))
         rows.step(np.array([[0, 1, 2], [3, 2, 1]]), nobody)
     n_actions = 4 + allow_wait
     for bad in (n_actions, 8, 2**32, -1, -(2**63)):

@@ -25,6 +25,10 @@ LAYERS: tuple[str, ...] = (
     "mapp_env.map_format",
     "mapp_env.grid",
     "mapp_env.grids",
+    "mapp_env.engine.state",  # the rules stand below what is played by them
+    "mapp_env.engine.rules",
+    "mapp_env.engine.observation",
+    "mapp_env.engine.world",
     "mapp_env.problem",
     "mapp_env.engine",
     "mapp_env.plans",

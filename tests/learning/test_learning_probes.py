@@ -16,7 +16,7 @@ from baselines.networks import network_spec
 from mapp_env import Grid
 from mapp_env.engine.rules import step_row
 from mapp_env.engine.state import new_rows, split
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 
 LEFT, RIGHT, UP, DOWN = range(4)
 SQUARE = Grid.from_text("D..\n...\n...")

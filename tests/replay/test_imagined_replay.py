@@ -13,7 +13,7 @@ from baselines.replay.relabelled import RelabelledReward, relabelled_reward
 from mapp_env import Grid, make_grid
 from mapp_env.engine.rules import Reward, step_row
 from mapp_env.engine.state import new_rows, split
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 
 GRIDS = {
     "paper": make_grid("paper-7x7"),

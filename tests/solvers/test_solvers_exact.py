@@ -21,7 +21,7 @@ import mapp_env
 from mapp_env import Grid, Problem, mapp_v0, replay, solve
 from mapp_env.engine.rules import measure_row, reset_row, step_row
 from mapp_env.engine.state import State, World, new_rows, split
-from mapp_env.engine.task import make_world
+from mapp_env.engine.world import make_world
 from mapp_env.solvers import exact, solve_universe
 from mapp_env.solvers.batch import least_worst
 from mapp_env.solvers.bounds import lower_bound, tree_bound
@@ -141,7 +141,8 @@ def row_at_reset(problem: Problem) -> tuple[np.ndarray, World]:
     sizes = (problem.n_agents, len(problem.landmarks))
     world = make_world(problem.grid, *sizes)
     row = new_rows(1, *sizes)[0]
-    reset_row(row, np.array(problem.landmarks, np.int32), problem.grid.depot, world)
+    cells = np.array(problem.start_cells, np.int32)
+    reset_row(row, np.array(problem.landmarks, np.int32), cells, world)
     return row, world
 
 

@@ -1,0 +1,73 @@
+"""The world of a task: the tables that the rules look up, of one grid or of several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapp_env.engine.observation import PATH_OBSERVATIONS, Observation
+from mapp_env.engine.rules import PATH_REWARDS, Reward, reward_distances
+from mapp_env.engine.state import (
+    ALL_PAIRS,
+    LANDMARKS,
+    MOVES,
+    NO_DISTANCES,
+    World,
+    cell_table,
+    path_distances,
+)
+from mapp_env.grid import Grid
+
+
+def needs_paths(reward: Reward, observation: Observation, actions: int) -> bool:
+    """Return whether rows look up shortest paths to their landmarks."""
+    return reward in PATH_REWARDS or observation in PATH_OBSERVATIONS or actions == LANDMARKS
+
+
+def make_world(
+    grids: Grid | Sequence[Grid],
+    n_agents: int,
+    n_landmarks: int,
+    reward: Reward = Reward.STEP,
+    observation: Observation = Observation.GLOBAL,
+    fields: NDArray[np.int32] = NO_DISTANCES[:0],
+    actions: int = MOVES,
+    return_home: bool = False,
+) -> World:
+    """Return what the rules look up on a grid, or on several; sizes are not checked here.
+
+    ``fields``, shape (B * K, C), C of the largest grid, is where shortest paths from the rows'
+    landmarks will stand; if it is empty, those of all pairs do. Raises a ValueError if shortest
+    paths are looked up, without fields, on several grids or on one too large for all pairs.
+    """
+    pool = (grids,) if isinstance(grids, Grid) else tuple(grids)
+    tables = [cell_table(grid) for grid in pool]
+    sizes = [len(table) for table in tables]
+    width = max(grid.cols for grid in pool)
+    lines = np.array(
+        [
+            (first, size, grid.depot, width)
+            for first, size, grid in zip(np.cumsum([0, *sizes[:-1]]), sizes, pool, strict=True)
+        ],
+        np.int32,
+    )
+    table = tables[0] if len(tables) == 1 else np.concatenate(tables)
+    for array in (lines, table):
+        array.flags.writeable = False
+    paths = NO_DISTANCES, ALL_PAIRS
+    if observation in PATH_OBSERVATIONS or actions == LANDMARKS:
+        paths = path_distances(pool, fields)
+    return World(
+        n_agents,
+        n_landmarks,
+        int(reward),
+        int(observation),
+        actions,
+        int(return_home),
+        lines,
+        table,
+        *reward_distances(reward, pool, fields),
+        *paths,
+    )
