@@ -29,6 +29,7 @@ MOVES = ((0, -1), (0, 1), (-1, 0), (1, 0), (0, 0))
 
 REWARDS = ("manhattan", "geodesic", "step")
 OBSERVATIONS = ("global", "own_first", "planes", "geodesic")
+OBSERVATIONS += ("distances",)
 
 
 def depot_of(rows: Sequence[str]) -> int:

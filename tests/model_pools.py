@@ -13,9 +13,6 @@ from typing import Any
 
 from model import REWARDS, Model, landmark_cells, random_rows
 
-LOW = 2**32 - 1
-KINDS = ("global", "own_first", "planes", "geodesic", "distances")
-
 Rows = tuple[str, ...]
 
 
