@@ -14,7 +14,7 @@ from mapp_env.solvers import optimal_costs, solve
 from mapp_env.solvers.batch import MAX_BATCH_LANDMARKS
 from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS
-from mapp_env.solvers.solution import landmark_distances
+from mapp_env.solvers.solution import problem_distances
 
 MAX_REGRET_LANDMARKS = MAX_BATCH_LANDMARKS
 """Most landmarks for which the cost that is left is looked up in the middle of an episode."""
@@ -51,7 +51,7 @@ def proven_costs(
             if n_landmarks <= MAX_EXACT_LANDMARKS:
                 optimum[row] = bound[row] = solve(problem, objective, "exact").cost
             else:
-                bound[row] = lower_bound(problem, objective, landmark_distances(problem))
+                bound[row] = lower_bound(problem, objective, problem_distances(problem))
             if progress is not None:
                 progress.add(1)
         optimum, bound = (
