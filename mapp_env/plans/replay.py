@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.rules import measure_row, reset_row, step_row
-from mapp_env.engine.state import Packed, World, new_rows, split_row
+from mapp_env.engine.state import Packed, new_rows, pack, split_row, unpack
 from mapp_env.engine.world import make_world
 from mapp_env.grid import Grid
 from mapp_env.plans.walks import close_tours
@@ -80,7 +80,7 @@ def _play(problem: Problem, data: bytes) -> Episode:
 
 @lru_cache(maxsize=2)
 def _world(grid: Grid, n_agents: int, n_landmarks: int) -> Packed:
-    return tuple(make_world(grid, n_agents, n_landmarks))
+    return pack(make_world(grid, n_agents, n_landmarks))
 
 
 @kernel
@@ -99,7 +99,7 @@ def play_row(
     says where they start; the step at which each landmark is visited and by whom, ``visits``
     (K, 2), zero on entry; and the costs (R8), (3,).
     """
-    own = World(*world)
+    own = unpack(world)
     state = split_row(row, own.n_agents, own.n_landmarks)
     reset_row(row, landmarks, cells[0], own)
     steps: int = actions.shape[0]

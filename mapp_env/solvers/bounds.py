@@ -9,8 +9,8 @@ from mapp_env.compiled import kernel
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem
 from mapp_env.solvers.exact import least_total
-from mapp_env.solvers.families import smallest_limit, smallest_limit_of
-from mapp_env.solvers.held_karp import Steps, agent_costs, route_tables
+from mapp_env.solvers.families import smallest_limit, smallest_limit_from
+from mapp_env.solvers.held_karp import Steps, route_tables
 from mapp_env.solvers.solution import UNBOUNDED, Distances, team_of
 from mapp_env.validation import check_choice
 
@@ -88,10 +88,10 @@ def subset_bound(distances: Distances, objective: str, low: int) -> int:
     teams, closed = team_of(objective, len(starts), len(nodes) - 1)
     if not starts[:, 0].any():
         return smallest_limit(route_tables(ways, closed)[1], teams, low)
-    own = np.ascontiguousarray(starts[:, nodes])
+    part = Distances(ways, np.ascontiguousarray(starts[:, nodes]))
     if objective == "total_distance":
-        return max(low, least_total(ways, own)[0])
-    return smallest_limit_of(agent_costs(ways, own, closed), low)
+        return max(low, least_total(part)[0])
+    return smallest_limit_from(part, closed, low)
 
 
 # -- spanning trees ------------------------------------------------------

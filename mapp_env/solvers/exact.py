@@ -24,17 +24,22 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.grid import FAR
 from mapp_env.problem import Problem
-from mapp_env.solvers.families import Families, smallest_limit, smallest_limit_of, split_among
+from mapp_env.solvers.families import (
+    Families,
+    smallest_limit,
+    smallest_limit_from,
+    split_among,
+    tours_from,
+)
 from mapp_env.solvers.held_karp import (
     Steps,
-    agent_costs,
     join_agent,
     route_tables,
     shortest_routes,
     tours_within,
     trace_route,
 )
-from mapp_env.solvers.solution import Solution, problem_distances, solution_of, team_of
+from mapp_env.solvers.solution import Distances, Solution, problem_distances, solution_of, team_of
 
 MAX_EXACT_LANDMARKS = 20  # the table of routes takes 80 MiB then
 FEW_AGENTS = 5  # up to here, a table per agent of the sets it needs is faster than one of all sets
@@ -58,16 +63,15 @@ def solve_exact(
     order = np.argsort(problem.landmarks)
     nodes = np.concatenate(([0], order + 1))
     between, starts = problem_distances(problem)
-    between = np.ascontiguousarray(between[np.ix_(nodes, nodes)])
-    starts = np.ascontiguousarray(starts[:, nodes])
-    if starts[:, 0].any():
+    distances = Distances(between[np.ix_(nodes, nodes)].copy(), starts[:, nodes].copy())
+    if distances.starts[:, 0].any():
         if objective == "total_distance":
-            optimum, routes = least_total(between, starts)
+            optimum, routes = least_total(distances)
         else:
-            optimum, routes = _least_longest(between, starts, objective == "makespan")
+            optimum, routes = _least_longest(distances, objective == "makespan")
     else:
         teams, closed = team_of(objective, problem.n_agents, n_landmarks)
-        optimum, routes = _solve_alike(between, teams, closed)
+        optimum, routes = _solve_alike(distances.between, teams, closed)
     found = [(order[route] + 1).tolist() for route in routes]
     return solution_of(problem, found, optimum, optimum)
 
@@ -96,43 +100,34 @@ def _trace(
 # -- from several starts -------------------------------------------------
 
 
-def _least_longest(between: Steps, starts: Steps, closed: bool) -> Answer:
+def _least_longest(distances: Distances, closed: bool) -> Answer:
     """Solve for the smallest longest route of agents that start anywhere."""
-    costs = agent_costs(between, starts, closed)
-    optimum = smallest_limit_of(costs)
-    routes = np.empty((len(costs[0]), len(between) - 1), np.int32)
-    tours: dict[int, Steps] = {}
-    for start, table in zip(starts, costs, strict=True):
-        if id(table) in tours:
-            continue
-        if closed:
-            tours[id(table)] = np.where(table <= optimum, table, FAR)
-        else:
-            # The way home starts where the route ends, so routes must come from the start.
-            shortest_routes(_leaving(between, start), routes)
-            tours[id(table)] = np.empty_like(table)
-            tours_within(between, routes, closed, optimum, tours[id(table)])
+    between, starts = distances
+    optimum = smallest_limit_from(distances, closed)
+    routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
+    tables: dict[bytes, Steps] = {}
+    for start in starts:
+        if start.tobytes() not in tables:
+            table = tables[start.tobytes()] = np.empty(len(routes), np.int32)
+            tours_from(between, start, closed, optimum, routes, table)
+    parts = split_among(distances, closed, optimum, [tables[start.tobytes()] for start in starts])
     found: list[NDArray[np.int32]] = []
-    for start, part in zip(starts, split_among([tours[id(c)] for c in costs]), strict=True):
+    for start, part in zip(starts, parts, strict=True):
         members = np.flatnonzero(part >> np.arange(len(between) - 1) & 1)
         nodes = np.concatenate(([0], members + 1))
         ways = np.ascontiguousarray(between[np.ix_(nodes, nodes)])
+        leaving = ways.copy()
+        leaving[0] = start[nodes]
         own = np.empty((1 << len(members), len(members)), np.int32)
-        shortest_routes(_leaving(ways, start[nodes]), own)
+        shortest_routes(leaving, own)
         route = _trace(ways, own, closed, optimum, len(own) - 1)
         found.append(members[route].astype(np.int32))
     return optimum, found
 
 
-def _leaving(between: Steps, start: Steps) -> Steps:
-    """Return distances whose line of the depot, node 0, is that of another start."""
-    ways = between.copy()
-    ways[0] = start
-    return ways
-
-
-def least_total(between: Steps, starts: Steps) -> Answer:
+def least_total(distances: Distances) -> Answer:
     """Solve for the least sum of closed tours of agents that start anywhere."""
+    between, starts = distances
     order = np.lexsort(starts.T)
     routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
     sums = np.full(len(routes), FAR, np.int32)

@@ -6,10 +6,7 @@ start elsewhere have costs of their own.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
-from functools import reduce
-from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +14,7 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.grid import FAR
 from mapp_env.solvers.held_karp import Steps
+from mapp_env.solvers.solution import Distances
 
 
 def smallest_limit(costs: Steps, teams: int, low: int = 0) -> int:
@@ -38,38 +36,6 @@ def smallest_limit(costs: Steps, teams: int, low: int = 0) -> int:
     return low
 
 
-def smallest_limit_of(costs: Sequence[Steps], low: int = 0, high: int | None = None) -> int:
-    """Return the same for agents with a table of costs each; those that are alike share one.
-
-    Nothing below ``low`` is tried; ``high``, if it is given, is known to be enough.
-    """
-    tables = {id(table): table for table in costs}
-    agents = Counter(map(id, costs))
-    if high is None:
-        high = min(int(table[-1]) for table in tables.values())
-    single = 1 << np.arange(len(costs[0]).bit_length() - 1)
-    low = max(low, int(np.min([table[single] for table in tables.values()], axis=0).max()))
-    while low < high:
-        middle = (low + high) // 2
-        groups = [(Families(table <= middle), agents[key]) for key, table in tables.items()]
-        if _groups_cover(groups):
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-def _groups_cover(groups: Sequence[tuple[Families, int]]) -> bool:
-    """Return whether groups of agents, each alike, can visit everything."""
-    if len(groups) == 1:
-        families, agents = groups[0]
-        return families.cover(agents)
-    reach = [families[agents] for families, agents in groups]
-    half = len(reach) // 2
-    first, second = reduce(unions, reach[:half]), reduce(unions, reach[half:])
-    return bool((first & second[::-1]).any())
-
-
 class Families:
     """The sets of landmarks that 1, 2, 3, ... agents can visit within a limit.
 
@@ -88,7 +54,7 @@ class Families:
         """Return the family of so many agents, (2 ** K,) bool."""
         if teams not in self._families:
             half = teams // 2
-            self._families[teams] = unions(self[half], self[teams - half])
+            self._families[teams] = _unions(self[half], self[teams - half])
         return self._families[teams]
 
     def cover(self, teams: int) -> bool:
@@ -100,7 +66,7 @@ class Families:
         return bool((first & second[::-1]).any())
 
 
-def unions(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _unions(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the family of all unions of a set of one family and a set of another."""
     if first[-1] or second[-1]:
         return np.ones_like(first)
@@ -131,37 +97,176 @@ def sum_subsets(counts: NDArray[np.int64], sign: int) -> None:
         step *= 2
 
 
+# -- from several starts -------------------------------------------------
+
+# Where agents are not alike, they take their landmarks one agent after another. Of all ways in
+# which a set can be visited up to its last landmark one is the best: that of the fewest agents,
+# and of these the one with the shortest route of the last agent. For whatever another way goes on
+# with, the agent that does it could also start afresh, and be there no later (triangle inequality).
+
+STEP_BITS = 26  # for the steps of one route; above them stands the agent
+
+
+def smallest_limit_from(
+    distances: Distances, closed: bool, low: int = 0, high: int | None = None
+) -> int:
+    """Return the least limit within which agents that start anywhere visit everything.
+
+    Nothing below ``low`` is tried; ``high``, if it is given, is known to be enough.
+    """
+    between, starts = distances
+
+    def enough(limit: int) -> bool:
+        return bool(fewest_agents(distances, closed, limit)[-1] <= len(starts))
+
+    back = between[0, 1:] * np.int32(closed)
+    low = max(low, int((starts[:, 1:].min(axis=0) + back).max()))
+    if high is None:
+        # The smaller a limit, the sooner it is refuted.
+        high, step = low, max(1, low // 8)
+        while not enough(high):
+            low, high, step = high + 1, high + step, 2 * step
+    while low < high:
+        middle = (low + high) // 2
+        if enough(middle):
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+def fewest_agents(distances: Distances, closed: bool, limit: int) -> Steps:
+    """Return how many of the agents, the first ones, visit each set within a limit, (2 ** K,).
+
+    It is one more than there are where all of them together cannot.
+    """
+    between, starts = distances
+    n_agents, n_landmarks = len(starts), len(between) - 1
+    room = limit - between[0, 1:] * np.int32(closed)
+    # next_able[n, k]: the first agent from n on that can visit landmark k at all.
+    next_able = np.full((n_agents + 1, n_landmarks), n_agents, np.int32)
+    for agent in reversed(range(n_agents)):
+        able = starts[agent, 1:] <= room
+        next_able[agent] = np.where(able, agent, next_able[agent + 1])
+    routes = np.empty((1 << n_landmarks, n_landmarks), np.int32)
+    fewest = np.empty(len(routes), np.int32)
+    count_agents(between, starts, next_able, room.astype(np.int32), routes, fewest)
+    return fewest
+
+
+@kernel
+def count_agents(
+    between: Steps, starts: Steps, next_able: Steps, room: Steps, routes: Steps, fewest: Steps
+) -> None:
+    """Fill in ``fewest`` for :func:`fewest_agents`.
+
+    ``room``, (K,), are the steps that a route up to each landmark may have; ``routes``,
+    (2 ** K, K), the best way to visit a set up to a landmark: its last agent and that one's steps.
+    """
+    n_agents, n_landmarks = starts.shape[0], routes.shape[1]
+    nobody = np.int32(n_agents << STEP_BITS)
+    routes[0] = nobody
+    fewest[0] = 0
+    for members in range(1, fewest.shape[0]):
+        fewest[members] = n_agents + 1
+        if not holds_parts(fewest, members, n_landmarks, n_agents):
+            continue
+        best = nobody
+        for last in range(n_landmarks):
+            bit = 1 << last
+            least = nobody
+            if members & bit != 0:
+                agent = next_able[fewest[members ^ bit], last]
+                if agent < n_agents:
+                    least = np.int32((agent << STEP_BITS) + starts[agent, last + 1])
+                shorter = routes[members ^ bit]
+                steps = between[last + 1]
+                for before in range(n_landmarks):
+                    longer = np.int32(shorter[before] + steps[before + 1])
+                    fits = longer & np.int32((1 << STEP_BITS) - 1) <= room[last]
+                    least = min(least, longer if fits else nobody)
+            routes[members, last] = least
+            best = min(best, least)
+        fewest[members] = 1 + (best >> STEP_BITS)
+
+
+@kernel
+def holds_parts(values: Steps, members: int, n_landmarks: int, most: int) -> bool:
+    """Return whether a set without any one of its landmarks has a value of at most ``most``."""
+    for landmark in range(n_landmarks):
+        bit = 1 << landmark
+        if members & bit != 0 and values[members ^ bit] > most:
+            return False
+    return True
+
+
+@kernel
+def tours_from(
+    between: Steps, start: Steps, closed: bool, limit: int, routes: Steps, tours: Steps
+) -> None:
+    """Fill in each set's shortest closed tour of an agent within a limit, else ``FAR``, (2 ** K,).
+
+    As :func:`~mapp_env.solvers.held_karp.tours_within`, for an agent that starts ``start``,
+    (K + 1,), steps away; ``routes`` is room for (2 ** K, K) routes.
+    """
+    n_landmarks = routes.shape[1]
+    tours[0] = 0
+    routes[0] = FAR
+    for members in range(1, tours.shape[0]):
+        tours[members] = FAR
+        if not holds_parts(tours, members, n_landmarks, FAR - 1):
+            continue
+        tour = np.int32(FAR)
+        for last in range(n_landmarks):
+            bit = 1 << last
+            least = np.int32(FAR)
+            if members == bit:
+                least = start[last + 1]
+            elif members & bit != 0:
+                shorter = routes[members ^ bit]
+                steps = between[last + 1]
+                for before in range(n_landmarks):
+                    least = min(least, np.int32(shorter[before] + steps[before + 1]))
+            routes[members, last] = least
+            home = np.int32(least + between[0, last + 1])
+            if (home if closed else least) <= limit:
+                tour = min(tour, home)
+        tours[members] = tour
+
+
 # -- who visits what -----------------------------------------------------
 
 
-def split_among(tours: Sequence[Steps]) -> list[int]:
+def split_among(
+    distances: Distances, closed: bool, limit: int, tours: Sequence[Steps]
+) -> list[int]:
     """Return for each agent its set: disjoint, all landmarks together, the least sum of tours.
 
-    ``tours``, (2 ** K,) each, are what each set costs an agent, ``FAR`` if it cannot visit it;
-    together they can visit everything.
+    ``tours``, (2 ** K,) each, are what each set costs an agent, ``FAR`` if it cannot visit it
+    within the limit, within which all together visit everything.
     """
     if len(tours) == 1:
         return [len(tours[0]) - 1]
-    families = [table < FAR for table in tours]
     sizes = np.zeros(1, np.int64)
     while len(sizes) < len(tours[0]):
         sizes = np.concatenate((sizes, sizes + 1))
     # For each set how many sets it may be joined to. The first agent and the last have no table of
     # pairs to fill in, so these are the two with most.
     shares = (len(sizes) >> sizes).astype(np.float64)
-    order = np.argsort([-shares[family].sum() for family in families])
+    pairs = np.array([shares[table < FAR].sum() for table in tours])
+    order = np.argsort(-pairs)
     order = np.append(np.delete(order, 1), order[1])
-    before = list(accumulate((families[agent] for agent in order), unions))
-    after = list(accumulate((families[agent] for agent in order[::-1]), unions))[::-1]
+    between, starts = distances
+    before = fewest_agents(Distances(between, starts[order]), closed, limit)
+    after = fewest_agents(Distances(between, starts[order[::-1]]), closed, limit)[::-1]
     tables = [tours[order[0]]]
-    for place in range(1, len(order) - 1):
-        agent = order[place]
-        wanted = before[place] & after[place + 1][::-1]
+    for place, agent in enumerate(order[1:-1], 1):
+        wanted = (before <= place + 1) & (after <= len(order) - 1 - place)
         more = np.where(wanted, tables[-1], FAR)
-        if (1 << sizes[wanted]).sum() < shares[families[agent]].sum():
+        if (1 << sizes[wanted]).sum() < pairs[agent]:
             add_any_part(tours[agent], tables[-1], wanted, more)
         else:
-            parts = np.flatnonzero(families[agent])
+            parts = np.flatnonzero(tours[agent] < FAR)
             add_each_part(tours[agent], parts, tables[-1], wanted, more)
         tables.append(more)
     left = len(sizes) - 1
