@@ -48,7 +48,8 @@ def solve(
     Parameters
     ----------
     problem : Problem
-        Its step limit is ignored: it belongs to an episode, not to the optimum.
+        Its agents may start anywhere. Its step limit is ignored: it belongs to an episode, not to
+        the optimum.
     objective : {"cover_time", "makespan", "total_distance"}
         What is minimised. Ties in the first two go to the smaller total distance, with "exact"
         always.
