@@ -261,11 +261,21 @@ def cell_table(grid: Grid) -> NDArray[np.int16]:
     borders and walls vanish from the rules. Open has a bit for each action that bumps nothing, the
     lowest for left; a wall is 0. Short lines, as thousands of grids should stay in the cache.
     """
-    free = np.pad(~grid.walls, 1)
-    ways = free[1:-1, :-2], free[1:-1, 2:], free[:-2, 1:-1], free[2:, 1:-1], free[1:-1, 1:-1]
-    table = np.zeros((*grid.walls.shape, OPEN + 1), np.int16)
-    for action, stride in enumerate((-1, 1, -grid.cols, grid.cols, 0)):
-        way = ways[action] & ~grid.walls
-        table[..., action] = way * stride
-        table[..., OPEN] |= way.astype(np.int16) << action
-    return table.reshape(grid.n_cells, -1)
+    table = np.empty((grid.n_cells, OPEN + 1), np.int16)
+    fill_table(grid.moves, grid.walls.reshape(-1), table)
+    return table
+
+
+@kernel
+def fill_table(
+    moves: NDArray[np.int32], walls: NDArray[np.bool_], table: NDArray[np.int16]
+) -> None:
+    """Fill in a :func:`cell_table` from the cells that moves lead to, (C, 4), and walls, (C,)."""
+    for cell in range(walls.shape[0]):
+        ways = 0 if walls[cell] else 1 << WAIT
+        for action in range(N_ACTIONS):
+            change = moves[cell, action] - cell
+            table[cell, action] = change
+            ways |= (change != 0) << action
+        table[cell, WAIT] = 0
+        table[cell, OPEN] = ways
