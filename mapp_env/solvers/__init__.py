@@ -10,11 +10,22 @@ from mapp_env.plans.tours import tour_through, walk_tours
 from mapp_env.problem import Problem
 from mapp_env.solvers.batch import optimal_costs, solve_universe
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
+from mapp_env.solvers.oracle import next_costs, next_costs_of, regrets
 from mapp_env.solvers.solution import Solution, Solver
 from mapp_env.solvers.vrplib import save_vrplib
 from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, describe
 
-__all__ = ["METHODS", "Solution", "optimal_costs", "save_vrplib", "solve", "solve_universe"]
+__all__ = [
+    "METHODS",
+    "Solution",
+    "next_costs",
+    "next_costs_of",
+    "optimal_costs",
+    "regrets",
+    "save_vrplib",
+    "solve",
+    "solve_universe",
+]
 
 METHODS = ("auto", "exact", "search", "pyvrp")
 
