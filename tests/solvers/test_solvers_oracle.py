@@ -285,7 +285,7 @@ def test_wrong_distances_are_refused(changes: dict[str, Any], message: str) -> N
 
 def test_wrong_episodes_are_refused() -> None:
     """What is no problem or joint action, and more landmarks than can be solved."""
-    with pytest.raises(ValueError, match="^problem must be a"):
+    with pytest.raises(ValueError, match=r"^problem must be a"):
         regrets((0, 6), [[0]])  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at most 20 landmarks, got 21"):
         regrets(Problem(PAPER, PAPER.reachable[:21].tolist()), [[0, 0, 0]])
