@@ -15,7 +15,7 @@ from mapp_env.problem import MAX_AGENTS, check_grid
 from mapp_env.solvers.held_karp import Steps, route_costs, shortest_routes
 from mapp_env.solvers.oracle.states import (
     CHUNK_WORK,
-    MAX_BATCH_LANDMARKS as MAX_BATCH_LANDMARKS,
+    MAX_BATCH_LANDMARKS,
     Room,
     fill_optima,
     list_states,
