@@ -28,17 +28,18 @@ from mapp_env.solvers.families import (
     Families,
     smallest_limit,
     smallest_limit_from,
-    split_among,
     tours_from,
 )
 from mapp_env.solvers.held_karp import (
     Steps,
     join_agent,
+    joined_sums,
     route_tables,
     shortest_routes,
     tours_within,
     trace_route,
 )
+from mapp_env.solvers.partition import split_among
 from mapp_env.solvers.solution import Distances, Solution, problem_distances, solution_of, team_of
 
 MAX_EXACT_LANDMARKS = 20  # the table of routes takes 80 MiB then
@@ -129,23 +130,13 @@ def least_total(distances: Distances) -> Answer:
     """Solve for the least sum of closed tours of agents that start anywhere."""
     between, starts = distances
     order = np.lexsort(starts.T)
-    routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
-    sums = np.full(len(routes), FAR, np.int32)
-    sums[0] = 0
-    tables = [sums]
-    alike = np.append(False, (starts[order[1:]] == starts[order[:-1]]).all(axis=1))
-    for agent, again in zip(order, alike, strict=True):
-        if again and tables[-1] is tables[-2]:
-            tables.append(tables[-1])  # one more like the last, who was of no use
-            continue
-        more = np.empty_like(sums)
-        join_agent(between, starts[agent], tables[-1], routes, more)
-        tables.append(tables[-1] if np.array_equal(more, tables[-1]) else more)
+    tables = joined_sums(between, starts[order])
+    routes = np.empty((len(tables[0]), len(between) - 1), np.int32)
     found = [np.empty(0, np.int32)] * len(starts)
-    left = len(sums) - 1
+    left = len(routes) - 1
     for agent, more, fewer in reversed(list(zip(order, tables[1:], tables[:-1], strict=True))):
         if more[left] < fewer[left]:
-            join_agent(between, starts[agent], fewer, routes, np.empty_like(sums))
+            join_agent(between, starts[agent], fewer, routes, np.empty_like(fewer))
             found[agent], left = _trace_joined(between, starts[agent], fewer, routes, left)
     return int(tables[-1][-1]), found
 
