@@ -1,9 +1,9 @@
 """The exact solver: Held-Karp over every set of landmarks, then the best partition over agents.
 
-What is proven, for ``1 <= K <= 20`` landmarks and any number of agents:
+What is proven, for ``1 <= K <= 20`` landmarks and any number of agents that start anywhere:
 
-- ``total_distance``: the shortest closed tour of one agent (``held_karp``). By the triangle
-  inequality no team walks less.
+- ``total_distance``: the least sum of closed tours start -> ... -> depot of agents that claim
+  something. From the depot that is one agent's tour: by the triangle inequality no team walks less.
 - ``cover_time``, ``makespan``: the smallest T such that every landmark is in one of N sets that one
   agent each can visit within T, and, for the makespan, be home.
 - Among the plans of smallest cover time or makespan one of the smallest total distance: of all
@@ -51,7 +51,11 @@ def solve_exact(
 ) -> Solution:
     """Return optimal routes for up to 20 landmarks, the same for any order of them.
 
-    ``time_limit`` and ``seed`` are not used: the size bounds the work, and nothing is random.
+    ``time_limit`` and ``seed`` are not used: the size bounds the work, and nothing is random. From
+    the depot 16 landmarks take some hundredths of a second, 18 some tenths and 20 up to two or
+    three seconds; from up to 16 different starts a third of a second, a second and five. There are
+    problems that take longer: with one landmark so far off that all others fit into the time to it,
+    20 landmarks take 20 seconds for 16 agents.
 
     Raises a ValueError if there are more landmarks; nothing has been allocated then.
     """
