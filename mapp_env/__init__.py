@@ -16,6 +16,7 @@ import pettingzoo
 
 from mapp_env import mapp_v0, solvers
 from mapp_env.envs.vector_env import make_vec
+from mapp_env.evaluation import evaluate
 from mapp_env.files import FileError
 from mapp_env.grid import Grid
 from mapp_env.grids import grid_names, load_grids, make_grid, make_grids
@@ -31,6 +32,7 @@ __all__ = [
     "Plan",
     "Problem",
     "__version__",
+    "evaluate",
     "grid_names",
     "load_grids",
     "make_grid",

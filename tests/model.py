@@ -1,4 +1,4 @@
-"""The rules R1-R9 once more, as plain Python, written from the design and from nothing else.
+"""The rules R1-R12 once more, as plain Python, written from the design and from nothing else.
 
 This file is the second opinion the package is compared with, so it shares no code with it: a
 grid is a tuple of text rows, distances are a breadth-first search over those rows, and one step
@@ -29,6 +29,7 @@ MOVES = ((0, -1), (0, 1), (-1, 0), (1, 0), (0, 0))
 
 REWARDS = ("manhattan", "geodesic", "step")
 OBSERVATIONS = ("global", "own_first", "planes", "geodesic")
+OBSERVATIONS += ("distances",)
 
 
 def depot_of(rows: Sequence[str]) -> int:
@@ -74,7 +75,7 @@ def landmark_cells(rows: Sequence[str]) -> list[int]:
 
 @dataclass
 class Model:
-    """One episode of one problem under R2-R9.
+    """One episode of one problem under R2-R12; drawing the problem is in tests/model_pools.py.
 
     Parameters
     ----------
@@ -82,6 +83,12 @@ class Model:
         The grid: ``#`` wall, ``.`` free, ``D`` depot.
     landmarks
         Cells, in the order in which observations name them.
+    starts
+        Where the agents stand at first; all on the depot if it is None.
+    actions
+        What an action is: ``moves`` (R3) or ``landmarks`` (R11).
+    sides
+        Rows and columns to which the planes are padded with walls, if not the grid's own.
     """
 
     rows: tuple[str, ...]
@@ -90,6 +97,10 @@ class Model:
     reward_kind: str = "manhattan"
     allow_wait: bool = False
     max_cycles: int = 50
+    starts: tuple[int, ...] | None = None
+    actions: str = "moves"
+    return_home: bool = False
+    sides: tuple[int, int] | None = None
 
     cells: list[int] = field(init=False)
     visited: list[bool] = field(init=False)
@@ -105,15 +116,17 @@ class Model:
         depot = depot_of(self.rows)
         self.home = shortest(self.rows, depot)
         self.from_landmark = [shortest(self.rows, landmark) for landmark in self.landmarks]
-        self.cells = [depot] * self.n_agents
+        self.cells = [depot] * self.n_agents if self.starts is None else list(self.starts)
         self.visited = [False] * len(self.landmarks)
-        self.history = [[depot] for _ in range(self.n_agents)]
+        self.history = [[cell] for cell in self.cells]
         self.claimed = [[] for _ in range(self.n_agents)]
         self.claim_step = [0] * self.n_agents
 
     @property
     def n_actions(self) -> int:
-        """Four moves, or five when waiting is allowed."""
+        """Four moves, or five when waiting is allowed; or the landmarks and one more."""
+        if self.actions == "landmarks":
+            return len(self.landmarks) + 1
         return 5 if self.allow_wait else 4
 
     @property
@@ -121,13 +134,32 @@ class Model:
         """Whether the episode is over."""
         return self.terminated or self.truncated
 
+    @property
+    def solved(self) -> bool:
+        """Whether nothing is left to do: all visited and, with ``return_home``, all at home."""
+        at_home = all(self.home[cell] == 0 for cell in self.cells)
+        return all(self.visited) and (at_home or not self.return_home)
+
+    def move_of(self, cell: int, action: int) -> int:
+        """Return the move, 4 to stay, that an agent on ``cell`` makes by an action."""
+        if self.actions == "moves":
+            return action
+        if action == len(self.landmarks) and not self.return_home:
+            return 4
+        steps = self.home if action == len(self.landmarks) else self.from_landmark[action]
+        for move in range(4):
+            if steps[moved(self.rows, cell, move)] < steps[cell]:
+                return move
+        return 4
+
     def step(self, actions: Sequence[int]) -> tuple[float, bool, bool]:
         """Carry out one joint action; return (reward, terminated, truncated)."""
         assert not self.ended
         assert len(actions) == self.n_agents
         self.steps += 1
         self.cells = [
-            moved(self.rows, cell, action) for cell, action in zip(self.cells, actions, strict=True)
+            moved(self.rows, cell, self.move_of(cell, action))
+            for cell, action in zip(self.cells, actions, strict=True)
         ]
         for agent in range(self.n_agents):  # ascending: on one step the lowest index claims
             self.history[agent].append(self.cells[agent])
@@ -136,17 +168,20 @@ class Model:
                     self.visited[index] = True
                     self.claimed[agent].append(landmark)
                     self.claim_step[agent] = self.steps
-        if all(self.visited):
-            self.terminated = True
+        if all(self.visited) and self.covered_at is None:
             self.covered_at = self.steps
+        if self.solved:
+            self.terminated = True
         elif self.steps >= self.max_cycles:
             self.truncated = True
         return self.reward(), self.terminated, self.truncated
 
     def reward(self) -> float:
-        """Return the team reward of the present situation (R6)."""
-        if all(self.visited):
+        """Return the team reward of the present situation (R6, R12)."""
+        if self.solved:
             return 0.0
+        if all(self.visited):
+            return self.reward_of_the_way_home()
         if self.reward_kind == "step":
             return -1.0
         total = 0
@@ -154,6 +189,20 @@ class Model:
             if not self.visited[index]:
                 total += min(self.distance(cell, index, landmark) for cell in self.cells)
         return -float(total)
+
+    def reward_of_the_way_home(self) -> float:
+        """Return what R12 gives once nothing but the way home is left."""
+        if self.reward_kind == "step":
+            return -1.0
+        if self.reward_kind == "geodesic":
+            return -float(sum(self.home[cell] for cell in self.cells))
+        cols, depot = len(self.rows[0]), depot_of(self.rows)
+        return -float(
+            sum(
+                abs(cell // cols - depot // cols) + abs(cell % cols - depot % cols)
+                for cell in self.cells
+            )
+        )
 
     def distance(self, cell: int, index: int, landmark: int) -> int:
         """Return how far ``cell`` is from a landmark in the measure of the reward."""
@@ -175,12 +224,16 @@ class Model:
     def planes(self, agent: int) -> list[list[list[float]]]:
         """Return the planes wall, depot, self, share of the others, unvisited, visited."""
         n_rows, cols, depot = len(self.rows), len(self.rows[0]), depot_of(self.rows)
+        height, width = self.sides or (n_rows, cols)
         others = [cell for other, cell in enumerate(self.cells) if other != agent]
         seen = dict(zip(self.landmarks, self.visited, strict=True))
 
-        def values(cell: int) -> list[float]:
+        def values(row: int, col: int) -> list[float]:
+            if row >= n_rows or col >= cols:
+                return [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+            cell = row * cols + col
             return [
-                float(self.rows[cell // cols][cell % cols] == "#"),
+                float(self.rows[row][col] == "#"),
                 float(cell == depot),
                 float(cell == self.cells[agent]),
                 others.count(cell) / max(1, len(others)),
@@ -189,7 +242,7 @@ class Model:
             ]
 
         return [
-            [[values(row * cols + col)[plane] for col in range(cols)] for row in range(n_rows)]
+            [[values(row, col)[plane] for col in range(width)] for row in range(height)]
             for plane in range(6)
         ]
 
@@ -212,18 +265,31 @@ class Model:
             features += [float(steps[moved(self.rows, cell, a)] - own) for a in range(4)]
         return features
 
+    def distance_features(self, agent: int) -> list[float]:
+        """Return own ways, the others' ways, landmark to landmark, to the depot, unvisited."""
+        scale = len(self.rows) + len(self.rows[0])
+        team = [agent, *(other for other in range(self.n_agents) if other != agent)]
+        ways = [steps[self.cells[one]] for one in team for steps in self.from_landmark]
+        ways += [steps[landmark] for steps in self.from_landmark for landmark in self.landmarks]
+        ways += [self.home[landmark] for landmark in self.landmarks]
+        return [*(way / scale for way in ways), *(float(not seen) for seen in self.visited)]
+
     def observation(self, kind: str, agent: int) -> list[float] | list[list[list[float]]]:
-        """Return what an agent sees in any of the four kinds."""
+        """Return what an agent sees in any of the kinds."""
         if kind == "global":
             return self.global_observation()
         if kind == "own_first":
             return self.own_first(agent)
+        if kind == "distances":
+            return self.distance_features(agent)
         if kind == "planes":
             return self.planes(agent)
         return self.geodesic_features(agent)
 
     def action_mask(self, agent: int) -> list[int]:
-        """Return 1 for each action that does not bump; waiting never bumps."""
+        """Return 1 for each action that does not bump, or is no walk to a visited landmark."""
+        if self.actions == "landmarks":
+            return [*(int(not seen) for seen in self.visited), 1]
         cell = self.cells[agent]
         return [
             int(action == 4 or moved(self.rows, cell, action) != cell)
@@ -231,14 +297,25 @@ class Model:
         ]
 
     def metrics(self) -> dict[str, float | bool]:
-        """Return R8 scored: routes cut at the last claim and closed by a shortest path."""
-        if self.covered_at is None:
+        """Return R8 scored: routes cut at the last claim and closed by a shortest path.
+
+        With ``return_home`` (R12) everything is as it was really walked.
+        """
+        if self.covered_at is None or not self.terminated:
             inf = math.inf
             return {
                 "success": False,
                 "cover_time": inf,
                 "makespan": inf,
                 "total_distance": inf,
+            }
+        if self.return_home:
+            walked = [a != b for route in self.history for a, b in itertools.pairwise(route)]
+            return {
+                "success": True,
+                "cover_time": float(self.covered_at),
+                "makespan": float(self.steps),
+                "total_distance": float(sum(walked)),
             }
         arrivals, distances = [0], [0]
         for agent in range(self.n_agents):
@@ -269,15 +346,19 @@ def joint_number(actions: Sequence[int], n_actions: int) -> int:
 def lively_action(model: Model, rng: random.Random) -> list[int]:
     """Return a joint action that is half random, half a step towards an unvisited landmark.
 
-    Purely random walks rarely finish an episode, purely greedy ones rarely bump or run out.
+    Where all are visited, and the agents have to go home, it is half a step home. Purely random
+    walks rarely finish an episode, purely greedy ones rarely bump or run out.
     """
     actions = []
     for agent, cell in enumerate(model.cells):
         action = rng.randrange(model.n_actions)
         wanted = [i for i, seen in enumerate(model.visited) if not seen]
-        if wanted and rng.random() < 0.6:
-            index = wanted[(agent + model.steps // 9) % len(wanted)]
-            steps = model.from_landmark[index]
+        if (wanted or model.return_home) and rng.random() < 0.6:
+            index = wanted[(agent + model.steps // 9) % len(wanted)] if wanted else None
+            if model.actions == "landmarks":
+                actions.append(len(model.landmarks) if index is None else index)
+                continue
+            steps = model.home if index is None else model.from_landmark[index]
             closer = [a for a in range(4) if steps[moved(model.rows, cell, a)] < steps[cell]]
             if closer:
                 action = rng.choice(closer)
