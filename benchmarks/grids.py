@@ -19,7 +19,7 @@ import numpy as np
 
 from mapp_env import Grid, make_grid, make_grids, sample_problems
 from mapp_env.engine.loops import fill_fields
-from mapp_env.engine.state import cell_table, new_rows, split
+from mapp_env.engine.state import cell_table, new_rows, pack, split
 from mapp_env.engine.world import make_world
 
 NAMES = ("random", "rooms", "maze", "warehouse")
@@ -42,10 +42,10 @@ def fields_of(grid: Grid) -> Callable[[], None]:
     """Return the filling of the fields of some rows, each with a problem of its own."""
     rows = new_rows(ROWS, 1, N_LANDMARKS)
     split(rows, 1, N_LANDMARKS).landmarks[:] = sample_problems(grid, ROWS, N_LANDMARKS, seed=1)
-    fields = np.empty((ROWS * N_LANDMARKS, grid.n_cells), np.int32)
-    queue = np.empty(grid.n_cells, np.int32)
-    world, indices = tuple(make_world(grid, 1, N_LANDMARKS)), np.arange(ROWS)
-    return lambda: fill_fields(rows, indices, fields, queue, world)
+    fields = np.empty((ROWS * grid.n_cells, N_LANDMARKS), np.int32)
+    scratch = np.empty((N_LANDMARKS + 1, grid.n_cells), np.int32)
+    world, indices = pack(make_world(grid, 1, N_LANDMARKS)), np.arange(ROWS)
+    return lambda: fill_fields(rows, indices, grid.moves, fields, scratch, world)
 
 
 def main() -> None:
