@@ -68,7 +68,7 @@ def solve_exact(
         if objective == "total_distance":
             optimum, routes = least_total(distances)
         else:
-            optimum, routes = _least_longest(distances, objective == "makespan")
+            optimum, routes = least_longest(distances, objective == "makespan")
     else:
         teams, closed = team_of(objective, problem.n_agents, n_landmarks)
         optimum, routes = _solve_alike(distances.between, teams, closed)
@@ -100,7 +100,7 @@ def _trace(
 # -- from several starts -------------------------------------------------
 
 
-def _least_longest(distances: Distances, closed: bool) -> Answer:
+def least_longest(distances: Distances, closed: bool) -> Answer:
     """Solve for the smallest longest route of agents that start anywhere."""
     between, starts = distances
     optimum = smallest_limit_from(distances, closed)
