@@ -30,7 +30,7 @@ class MappSb3VecEnv(RowsVecEnv):
 
     - ``terminal_observation``: the last observation;
     - ``TimeLimit.truncated``: whether the step limit ended it, so that its value is bootstrapped;
-    - ``is_success``: whether all landmarks were visited, for the logged success rate;
+    - ``is_success``: whether the problem was solved, for the logged success rate;
     - ``metrics``: success, cover_time, makespan and total_distance;
     - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them, so that
       no ``VecMonitor`` is needed.
