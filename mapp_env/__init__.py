@@ -16,9 +16,10 @@ import pettingzoo
 
 from mapp_env import mapp_v0, solvers
 from mapp_env.envs.vector_env import make_vec
+from mapp_env.evaluation import evaluate
 from mapp_env.files import FileError
 from mapp_env.grid import Grid
-from mapp_env.grids import grid_names, make_grid
+from mapp_env.grids import grid_names, load_grids, make_grid, make_grids
 from mapp_env.map_format import MapError
 from mapp_env.plans.plan import Plan, replay
 from mapp_env.problem import Problem, sample_problems
@@ -31,8 +32,11 @@ __all__ = [
     "Plan",
     "Problem",
     "__version__",
+    "evaluate",
     "grid_names",
+    "load_grids",
     "make_grid",
+    "make_grids",
     "make_vec",
     "mapp_v0",
     "replay",

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.map_format import MAX_SIDE, MapError, ParsedMap, parse_map, read_map
+from mapp_env.map_format import (
+    MAX_FILE_BYTES,
+    MAX_SIDE,
+    MapError,
+    ParsedMap,
+    check_letters,
+    parse_map,
+    read_map,
+)
 from mapp_env.validation import as_array, as_integer, describe
 
 MAX_ALL_PAIRS_CELLS = 4096
@@ -34,7 +42,7 @@ class Grid:
     Parameters
     ----------
     walls : array_like of bool, shape (rows, cols)
-        ``True`` where no agent can stand; 1 to 512 rows and columns.
+        ``True`` where no agent can stand; 1 to 2048 rows and columns.
     depot : int or (int, int), optional
         The free cell, or its row and column, where all agents start. By default the free cell
         nearest to the centre (smallest index among equals).
@@ -89,38 +97,53 @@ class Grid:
     # -- reading and writing -----------------------------------------------------------
 
     @classmethod
-    def from_text(cls, text: str, depot: object = None) -> Grid:
+    def from_text(
+        cls, text: str, depot: object = None, free: object = None, walls: object = None
+    ) -> Grid:
         """Build a grid from rows of characters, plain or with a MovingAI header.
 
         Parameters
         ----------
         text : str
-            ``#``, ``@``, ``T``, ``O`` are walls; ``.``, ``G`` free cells; ``D`` the depot. Where it
-            starts with a line break, as a triple-quoted string may, all lines may be indented
-            alike.
+            ``#``, ``@``, ``T``, ``O`` are walls; ``.``, ``G`` free cells; ``D`` the depot. Below a
+            header ``W`` is a wall, too, and ``S`` and ``E`` are free. Where the text starts with a
+            line break, as a triple-quoted string may, all lines may be indented alike.
         depot : int or (int, int), optional
             Overrides the text's depot; without either, the free cell nearest to the centre.
+        free, walls : str or set of str, optional
+            Letters that mean a free cell, or a wall, in this text, whatever they mean otherwise;
+            all others keep their meaning. ``walls="E"`` closes a map's ``E`` cells.
 
         Raises
         ------
         ValueError
-            If the text is malformed; the message names the line.
+            If the text is malformed, the message names the line; or if ``free`` or ``walls`` holds
+            anything but single ASCII letters, or a letter is in both.
         """
+        letters = check_letters(free, walls)
         if not isinstance(text, str):
             raise ValueError(f"text must be a str of map rows, got {describe(text)}")
-        if text.startswith("\n"):
+        if text.startswith("\n") and len(text) <= MAX_FILE_BYTES:
             text = textwrap.dedent(text)
-        return cls._from_parsed(parse_map(text), depot, "text")
+        return cls._from_parsed(parse_map(text, letters=letters), depot, "text")
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], depot: object = None) -> Grid:
-        """Read a grid from a file of at most 1 MiB: rows of characters, or a MovingAI ``.map``.
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        depot: object = None,
+        free: object = None,
+        walls: object = None,
+    ) -> Grid:
+        """Read a grid from a file of at most 8 MiB: rows of characters, or a MovingAI ``.map``.
 
         Parameters
         ----------
         path : str or os.PathLike
             The file.
         depot : int or (int, int), optional
+            As for :meth:`from_text`.
+        free, walls : str or set of str, optional
             As for :meth:`from_text`.
 
         Raises
@@ -129,10 +152,11 @@ class Grid:
             If the file cannot be opened, is not a regular file, is too large or is malformed; the
             message names path and line.
         """
+        letters = check_letters(free, walls)
         source = os.fspath(path) if isinstance(path, str | os.PathLike) else None
         if not isinstance(source, str):
             raise ValueError(f"path must be a str or os.PathLike of one, got {describe(path)}")
-        return cls._from_parsed(read_map(source), depot, source)
+        return cls._from_parsed(read_map(source, letters), depot, source)
 
     @classmethod
     def _from_parsed(cls, parsed: ParsedMap, depot: object, source: str) -> Grid:
@@ -192,11 +216,10 @@ class Grid:
 
     def _centre(self) -> int:
         """Return the free cell nearest to the middle of the grid."""
-        free = np.flatnonzero(~self.walls)
-        row, col = np.divmod(free, self.cols)
         # Doubled coordinates keep the centre of an even side whole.
-        offset = (2 * row - self.rows + 1) ** 2 + (2 * col - self.cols + 1) ** 2
-        return int(free[np.argmin(offset)])
+        row, col = (np.arange(1 - side, side, 2) ** 2 for side in self.walls.shape)
+        # More than any offset: walls are never nearest.
+        return int(np.argmin(np.where(self.walls, 4 * MAX_SIDE**2, row[:, None] + col)))
 
     # -- tables ------------------------------------------------------------------------
 
@@ -206,14 +229,9 @@ class Grid:
 
         A move into a wall or off the grid leads to the cell itself; so does every move of a wall.
         """
-        cells = np.arange(self.n_cells, dtype=np.int32).reshape(self.walls.shape)
-        moves = np.repeat(cells[:, :, None], 4, axis=2)
-        moves[:, 1:, 0] = cells[:, :-1]
-        moves[:, :-1, 1] = cells[:, 1:]
-        moves[1:, :, 2] = cells[:-1]
-        moves[:-1, :, 3] = cells[1:]
-        blocked = self.walls.ravel()[moves] | self.walls[:, :, None]
-        return _frozen(np.where(blocked, cells[:, :, None], moves).reshape(-1, 4))
+        moves = np.empty((self.n_cells, 4), np.int32)
+        fill_moves(self.walls, moves)
+        return _frozen(moves)
 
     @cached_property
     def home(self) -> NDArray[np.int32]:
@@ -311,6 +329,24 @@ class Grid:
 
 
 @kernel
+def fill_moves(walls: NDArray[np.bool_], moves: NDArray[np.int32]) -> None:
+    """Write the cell that each move leads to, (C, 4 or more), on a grid with these walls."""
+    rows, cols = walls.shape
+    for row in range(rows):
+        for col in range(cols):
+            cell = row * cols + col
+            free = not walls[row, col]
+            moves[cell, 0] = cell - 1 if free and col > 0 and not walls[row, col - 1] else cell
+            moves[cell, 1] = (
+                cell + 1 if free and col + 1 < cols and not walls[row, col + 1] else cell
+            )
+            moves[cell, 2] = cell - cols if free and row > 0 and not walls[row - 1, col] else cell
+            moves[cell, 3] = (
+                cell + cols if free and row + 1 < rows and not walls[row + 1, col] else cell
+            )
+
+
+@kernel
 def fill_distances(
     moves: NDArray[np.int32],
     start: int,
@@ -320,25 +356,30 @@ def fill_distances(
 ) -> None:
     """Breadth-first search: write the steps from a free cell to every cell, shape (C,).
 
-    They are -1 where unreachable. ``queue``, shape (C,), is scratch space. Beyond ``stop`` no
-    distances are needed; those of all nearer cells are complete.
+    They are -1 where unreachable. ``moves``, (C, 4 or more), is a table whose first four columns
+    are the moves; ``queue``, (C,), is scratch space. Beyond ``stop`` no distances are needed; those
+    of all nearer cells are complete.
     """
     steps[:] = -1
     steps[start] = 0
-    queue[0] = start
-    head = 0
-    tail = 1
-    while head < tail:
-        cell = queue[head]
-        head += 1
+    # The start itself is never in the queue, so that a place is left behind the last cell found:
+    # each cell looked at is written there, and counted if it is new. Whether it is, is as good as
+    # random, and to guess it wrong would cost more than all the rest.
+    cell = np.uint32(start)
+    head = np.uint32(0)
+    tail = np.uint32(0)
+    while cell != stop:
+        ahead = np.uint32(steps[cell]) + np.uint32(1)
         for action in range(4):
-            to = moves[cell, action]
-            if steps[to] < 0:
-                steps[to] = steps[cell] + 1
-                if to == stop:
-                    return
-                queue[tail] = to
-                tail += 1
+            to = np.uint32(moves[cell, action])
+            known = np.uint32(steps[to])  # -1 becomes more than any number of steps
+            queue[tail] = to
+            tail += np.uint32(known > ahead)
+            steps[to] = min(known, ahead)
+        if head == tail:
+            return
+        cell = np.uint32(queue[head])
+        head += np.uint32(1)
 
 
 @kernel

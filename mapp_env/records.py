@@ -17,11 +17,11 @@ from mapp_env.validation import describe
 VERSION = 2
 """Of the files that are written; those of version 1, without a problem's starts, are read, too."""
 
-MAX_PROBLEM_BYTES = 1 << 20
-"""Largest problem file: the text of a 512 x 512 grid takes about a quarter of it."""
+MAX_PROBLEM_BYTES = 8 << 20
+"""Largest problem file: the text of a 2048 x 2048 grid takes about half of it."""
 
-MAX_PLAN_BYTES = 16 << 20
-"""Largest plan file: sixteen agents that act, and walk, for half a million steps each.
+MAX_PLAN_BYTES = 24 << 20
+"""Largest plan file: a problem, and sixteen agents that act, and walk, half a million steps each.
 
 On a 512 x 512 grid a shortest path, which leaves a third of the cells aside, and the way back take
 350,000.

@@ -12,6 +12,7 @@ from baselines.networks.layers import Head, encode, linear
 from mapp_env import Grid
 from mapp_env.engine.loops import observe_rows
 from mapp_env.engine.observation import N_FEATURES, Observation
+from mapp_env.engine.state import pack
 from mapp_env.engine.world import make_world
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.validation import check_count
@@ -64,7 +65,7 @@ class GeodesicNetwork(Network):
         super().__init__(spec)
         grid = Grid.from_text(spec.grid)
         world = make_world(grid, spec.n_agents, spec.n_landmarks, observation=Observation.GEODESIC)
-        self.world = tuple(world)
+        self.world = pack(world)
         units = spec.code_units
         self.landmark = nn.Sequential(
             linear(N_FEATURES, units, generator),

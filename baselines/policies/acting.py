@@ -5,8 +5,7 @@ from typing import Protocol
 import numpy as np
 
 from baselines.networks import ANY
-from mapp_env import Grid
-from mapp_env.grid import tell_apart
+from mapp_env.evaluation.policies import check_grid as check_grid
 
 
 class Acting(Protocol):
@@ -14,16 +13,6 @@ class Acting(Protocol):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Return joint actions (B, N) for global observations (B, N + 2K)."""
-
-
-def check_grid(policy: object, grid: Grid) -> None:
-    """Raise a ValueError for a policy of another grid; one that names none plays on any."""
-    own = getattr(policy, "grid", None)
-    if isinstance(own, Grid) and own != grid:
-        raise ValueError(
-            f"policy must be one of this grid, or of any, got one of another; here "
-            f"{tell_apart(grid, own)}"
-        )
 
 
 def check_rows(observations: object) -> np.ndarray:

@@ -12,26 +12,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm  # type: ignore[import-untyped]
 
-from baselines.policies.acting import Acting, check_grid
-from baselines.policies.episodes import begin, make_envs
+from baselines.policies.acting import Acting
 from baselines.policies.settings import Setting
-from mapp_env import Plan, Problem, replay, sample_problems, solve
+from mapp_env import Plan, Problem, replay, sample_problems
+from mapp_env.evaluation.episodes import BATCH, Moments, play_episodes
+from mapp_env.evaluation.optima import proven_costs
+from mapp_env.evaluation.problems import enough_steps, group_problems
+from mapp_env.evaluation.progress import Progress
 from mapp_env.files import write_text
+from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_CYCLES
-from mapp_env.solvers import optimal_costs, solve_universe
+from mapp_env.solvers import solve_universe
+from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS
 from mapp_env.validation import check_count
 
 # Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
 # from streams spawned from their own seeds; those that coincide are left out one by one.
 EVALUATION_SEED = 0
-BATCH = 4096  # problems played at a time
 N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
-OBJECTIVES = ("cover_time", "makespan", "total_distance")
 MAX_TABLE_BYTES = 1 << 20
-MAX_BATCH_LANDMARKS = 12  # of optimal_costs()
-MAX_EXACT_LANDMARKS = 20  # of solve(method="exact")
 
 
 # -- problems ----------------------------------------------------------------------------------
@@ -83,7 +83,12 @@ def find_optima(setting: Setting, landmarks: np.ndarray) -> Optima | None:
     """Return the optima of problems (P, K); None if K is more than the exact solver takes."""
     if setting.n_landmarks > MAX_EXACT_LANDMARKS:
         return None
-    return Optima(*(_optimal_costs(setting, landmarks, objective) for objective in OBJECTIVES))
+    group, costs = setting.group(landmarks), []
+    for objective in OBJECTIVES:
+        bar = Progress(f"optima: {objective}", len(landmarks))
+        costs.append(proven_costs(group, objective, progress=bar).optimum.astype(np.int32))
+        bar.close()
+    return Optima(*costs)
 
 
 def out_of_reach(setting: Setting, optima: Optima | None) -> list[str]:
@@ -94,14 +99,6 @@ def out_of_reach(setting: Setting, optima: Optima | None) -> list[str]:
         f"more than {setting.max_cycles} steps at their optimum (the limit is --max-cycles)"
     )
     return [line] if (least > setting.max_cycles).any() else []
-
-
-def _optimal_costs(setting: Setting, landmarks: np.ndarray, objective: str) -> np.ndarray:
-    if setting.n_landmarks <= MAX_BATCH_LANDMARKS:
-        return optimal_costs(setting.grid, landmarks, setting.n_agents, objective)
-    rows = tqdm(landmarks.tolist(), desc=f"optima: {objective}", leave=False, disable=None)
-    problems = (Problem(setting.grid, row, setting.n_agents) for row in rows)
-    return np.array([solve(problem, objective, "exact").cost for problem in problems], np.int32)
 
 
 # -- episodes -----------------------------------------------------------------------------------
@@ -119,6 +116,7 @@ class Evaluation:
     makespan: np.ndarray  # (P,) float64, the way home included (R8)
     total_distance: np.ndarray  # (P,) float64, the way home included (R8)
     actions: np.ndarray  # (T, kept, N) int8, of the first problems; p took steps[p] of them
+    moments: Moments
     optima: Optima | None = None  # None: too many landmarks for a proven optimum
 
     def __post_init__(self) -> None:
@@ -174,53 +172,26 @@ def evaluate(
     of another grid.
     """
     check_count("n_kept", n_kept, 0, 1_000_000)
-    check_grid(policy, setting.grid)
     landmarks = np.asarray(landmarks)
-    if landmarks.ndim != 2 or landmarks.shape[0] == 0 or landmarks.shape[1] != setting.n_landmarks:
+    whole = landmarks.ndim == 2 and landmarks.dtype.kind in "iu"
+    if not whole or len(landmarks) == 0 or landmarks.shape[1] != setting.n_landmarks:
         raise ValueError(
             f"landmarks must be cells of shape (P, {setting.n_landmarks}) with P at least 1, got "
-            f"shape {landmarks.shape}"
+            f"{landmarks.dtype} of shape {landmarks.shape}"
         )
-    n_problems = len(landmarks)
-    n_kept = min(n_kept, n_problems)
-    batch = min(BATCH, n_problems)
-    envs = make_envs(setting, batch, setting.max_cycles)
-    costs = {name: np.full(n_problems, np.inf) for name in OBJECTIVES}
-    success = np.zeros(n_problems, np.bool_)
-    steps = np.zeros(n_problems, np.int64)
-    kept = np.zeros((setting.max_cycles, n_kept, setting.n_agents), np.int8)
-    bar = tqdm(
-        total=n_problems,
-        desc=progress,
-        unit=" problems",
-        leave=False,
-        disable=True if progress is None else None,  # None: if there is no terminal
-    )
-    for start in range(0, n_problems, batch):
-        # The last batch is filled up with problems played before; they are not read again.
-        rows = np.minimum(np.arange(start, start + batch), n_problems - 1)
-        unfinished = np.arange(batch) < n_problems - start
-        observations = begin(envs, landmarks[rows], seed=0)
-        actions = np.zeros((batch, setting.n_agents), np.int64)
-        for step in range(setting.max_cycles):
-            actions[unfinished] = policy.act(observations[unfinished])
-            if start < n_kept:
-                drawn = unfinished & (rows < n_kept)
-                kept[step, rows[drawn]] = actions[drawn]
-            observations, _, terminated, truncated, infos = envs.step(actions)
-            ended = unfinished & (terminated | truncated)
-            if ended.any():
-                steps[rows[ended]] = step + 1
-                success[rows[ended]] = infos["metrics"]["success"][ended]
-                for name, cost in costs.items():
-                    cost[rows[ended]] = infos["metrics"][name][ended]
-                bar.update(int(ended.sum()))
-            unfinished &= ~ended  # results after a row's reset are ignored
-            if not unfinished.any():
-                break
+    bar = Progress(progress, len(landmarks))
+    episodes = play_episodes(policy, setting.group(landmarks), {}, n_kept, BATCH, bar)
     bar.close()
-    envs.close()
-    return Evaluation(setting, landmarks, success, steps, **costs, actions=kept, optima=optima)
+    return Evaluation(
+        setting,
+        landmarks,
+        episodes.solved,
+        episodes.steps,
+        **episodes.costs,
+        actions=episodes.actions,
+        moments=episodes.moments,
+        optima=optima,
+    )
 
 
 def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = None) -> list[Plan]:
@@ -241,22 +212,19 @@ def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = N
     ValueError
         If the policy is of another grid than a problem, or cannot play it.
     """
-    alike: dict[Setting, list[int]] = {}
-    for index, problem in enumerate(problems):
-        grid, n_landmarks = problem.grid, len(problem.landmarks)
-        limit = problem.max_cycles if max_cycles is None else max_cycles
-        if limit is None:
-            limit = min(2 * int(np.max(grid.home)) * n_landmarks, MAX_CYCLES)
-        setting = Setting(grid, problem.n_agents, n_landmarks, limit)
-        alike.setdefault(setting, []).append(index)
+    limits = [
+        check_count("max_cycles", max_cycles, 1, MAX_CYCLES)
+        if max_cycles is not None
+        else problem.max_cycles or enough_steps(problem.grid, len(problem.landmarks))
+        for problem in problems
+    ]
     plans = {}
-    for setting, indices in alike.items():
-        landmarks = np.array([problems[index].landmarks for index in indices])
-        episodes = evaluate(policy, setting, landmarks, n_kept=len(indices))
-        for row, index in enumerate(indices):
-            problem = replace(problems[index], max_cycles=setting.max_cycles)
-            plans[index] = replay(problem, episodes.actions[: episodes.steps[row], row])
-    return [plans[index] for index in range(len(problems))]
+    for group in group_problems(problems, limits):
+        episodes = play_episodes(policy, group, {}, n_kept=len(group.places))
+        for row, place in enumerate(group.places.tolist()):
+            problem = replace(problems[place], max_cycles=limits[place])
+            plans[place] = replay(problem, episodes.actions[: episodes.steps[row], row])
+    return [plans[place] for place in range(len(problems))]
 
 
 # -- tables ------------------------------------------------------------------------------------

@@ -4,10 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from baselines.policies.policy import NetworkPolicy, find_weights, load_policy
 from baselines.runs.folder import CONFIG_FILE, read_config
 from mapp_env import Grid, Problem
 from mapp_env.engine.state import N_ACTIONS
+from mapp_env.evaluation.problems import Group, group_rows
 from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, MAX_LANDMARKS
 from mapp_env.validation import check_count
 
@@ -31,6 +34,10 @@ class Setting:
                 f"landmarks must be {self.n_landmarks} cells for this policy, got {len(landmarks)}"
             )
         return Problem(self.grid, landmarks, self.n_agents, self.max_cycles)
+
+    def group(self, landmarks: np.ndarray) -> Group:
+        """Return problems, a row of landmarks each, as they are played together."""
+        return group_rows(self.grid, landmarks, self.n_agents, self.max_cycles)
 
 
 class PolicyOfRun(NamedTuple):

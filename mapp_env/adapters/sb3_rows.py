@@ -45,10 +45,11 @@ class RowsVecEnv(VecEnv):
         self._actions = actions
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions bump no agent, as sb3-contrib's ``MaskablePPO`` asks for it.
+        """Return which actions the masks advise, as sb3-contrib's ``MaskablePPO`` asks for it.
 
-        Of one agent's actions (B, A), of numbered joint actions (B, A**N), or of each agent's
-        actions, one agent after the other, (B, N * A). Raises a ResetNeeded before the first reset.
+        False for a move that bumps an agent, or a landmark that is visited. Of one agent's actions
+        (B, A), of numbered joint actions (B, A**N), or of each agent's actions, one agent after the
+        other, (B, N * A). Raises a ResetNeeded before the first reset.
         """
         if self._masks is None:
             raise ResetNeeded("action_masks() needs episodes: call reset() first")

@@ -26,7 +26,8 @@ class SharedVecEnv(RowsVecEnv):
     itself is shared by all agents. Each ended row's info holds ``terminal_observation`` and
     ``is_success``; each info says by ``TimeLimit.truncated`` whether the step limit has ended the
     row, which SuperSuit's own wrapper for Stable-Baselines3 leaves out (and it fails when it is
-    seeded).
+    seeded). With a pool, each info has ``grid``, the number of the grid that the step was played
+    on, and ``reset_infos`` those of the first episodes.
 
     Parameters
     ----------
@@ -48,6 +49,7 @@ class SharedVecEnv(RowsVecEnv):
                 f"n_agents must divide the {venv.num_envs} rows of venv, got {n_agents}"
             )
         self.venv = venv
+        self._grids: list[int | None] = []  # of a pool, of each row's present episode
         self.n_agents = n_agents
         super().__init__(venv, "venv", venv.observation_space, venv.action_space)
 
@@ -83,7 +85,7 @@ class SharedVecEnv(RowsVecEnv):
         Parameters
         ----------
         options : dict, optional
-            ``"landmarks"`` or ``"problem"``, as in the PettingZoo face.
+            ``"landmarks"``, ``"grid"`` or ``"problem"``, as in the PettingZoo face.
 
         Raises
         ------
@@ -109,7 +111,7 @@ class SharedVecEnv(RowsVecEnv):
         observations, found = self.venv.reset(seed=self._seed, options=self._next_options)
         self._seed, self._next_options = None, None
         self.reset_infos = list(found)
-        self._keep_masks(found)
+        self._keep_moment(found)
         return np.array(observations)
 
     def step_wait(self) -> Stepped:
@@ -129,16 +131,20 @@ class SharedVecEnv(RowsVecEnv):
             for info, late in zip(found, (truncations & ~terminations).tolist(), strict=True)
         ]
         dones = terminations | truncations
+        played = self._grids
+        self._keep_moment(infos)
         for row in np.flatnonzero(dones).tolist():
             infos[row]["is_success"] = bool(terminations[row])
-        self._keep_masks(infos)
+            if "grid" in infos[row]:  # SuperSuit gives the next episode's
+                infos[row]["grid"] = played[row]
         return np.array(observations), np.array(rewards), dones, infos
 
     def _find_masks(self, masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return masks.copy()
 
-    def _keep_masks(self, infos: Sequence[dict[str, Any]]) -> None:
-        """Keep a copy of the masks: infos are the caller's."""
+    def _keep_moment(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Keep the rows' grids and a copy of the masks: infos are the caller's."""
+        self._grids = [info.get("grid") for info in infos]
         self._masks = np.stack([info["action_mask"] for info in infos]).astype(np.bool_)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
 from mapp_env.adapters.sb3_rows import RowsVecEnv, Stepped
+from mapp_env.engine.options import check_grid_number
 from mapp_env.engine.seeds import spread_seed
 from mapp_env.envs.central_env import central_action_masks
 from mapp_env.envs.vector_env import MappVectorEnv
@@ -34,7 +35,9 @@ class MappSb3VecEnv(RowsVecEnv):
     - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them, so that
       no ``VecMonitor`` is needed.
 
-    Infos of the other rows are empty. Each is its row's own, as wrappers write into them: with
+    With a pool, every info has ``grid``, the number of the grid that the step was played on, and
+    ``reset_infos`` those of the first episodes. Else infos of the other rows are empty. Each is its
+    row's own, as wrappers write into them: with
     4,096 rows the form has 0.44 of the engine's speed for it, where one dict for all left 0.75
     (``benchmarks/sb3_vec.py``); a training by PPO takes no longer. Action masks are
     :meth:`action_masks`.
@@ -108,8 +111,9 @@ class MappSb3VecEnv(RowsVecEnv):
         ----------
         options : dict or list of dict, optional
             As the batch takes them: ``"grid"``, ``"landmarks"`` or ``"problem"``, for all rows
-            alike or for each. A list has a dict for each row, all with ``"landmarks"`` or
-            ``"problem"``.
+            alike or for each. A list has a dict for each row, all with ``"problem"`` or
+            ``"landmarks"`` (and ``"grid"``, in an environment with a pool), or all with ``"grid"``
+            alone.
 
         Raises
         ------
@@ -121,30 +125,37 @@ class MappSb3VecEnv(RowsVecEnv):
                 raise ValueError("options['reset_mask'] cannot be chosen: reset() is for all rows")
             self._next_options = None if options is None else deepcopy(dict(options))
             return
-        self._next_options = {"problem": self._problems_of(options)}
-
-    def _problems_of(self, options: Any) -> list[Problem]:
-        """Return the problems of a list of options, one a row."""
         if not isinstance(options, Sequence) or len(options) != self.num_envs:
             raise ValueError(
-                f"options must be a dict, or a list of {self.num_envs} dicts with 'landmarks' or "
-                f"'problem', one a row, got {describe(options)}"
+                f"options must be a dict, or a list of {self.num_envs} dicts, one a row, got "
+                f"{describe(options)}"
             )
-        problems = []
-        for row, wanted in enumerate(options):
-            if not isinstance(wanted, Mapping) or not {"landmarks", "problem"} & set(wanted):
-                raise ValueError(
-                    f"options[{row}] must be a dict with 'landmarks' (in an environment with a "
-                    f"pool also 'grid') or 'problem', got {describe(wanted)}"
-                )
-            try:
-                problem = self.engine.find_problem(dict(wanted))
-            except ValueError as error:
-                raise ValueError(f"options[{row}]: {error}") from error
-            if problem is None:
-                raise ValueError(f"options[{row}] must fix the landmarks, got {describe(wanted)}")
-            problems.append(problem)
-        return problems
+        if all(isinstance(wanted, Mapping) and set(wanted) == {"grid"} for wanted in options):
+            task = self.engine.task
+            numbers = [
+                check_grid_number(task, wanted["grid"], f"options[{row}]['grid']")
+                for row, wanted in enumerate(options)
+            ]
+            self._next_options = {"grid": numbers}
+        else:
+            problems = [self._problem_of(row, wanted) for row, wanted in enumerate(options)]
+            self._next_options = {"problem": problems}
+
+    def _problem_of(self, row: int, wanted: Any) -> Problem:
+        """Return the problem that a row's options fix."""
+        keys = set(wanted) if isinstance(wanted, Mapping) else set()
+        if keys not in ({"landmarks"}, {"grid", "landmarks"}, {"problem"}):
+            raise ValueError(
+                f"options[{row}] must be a dict with 'problem', 'landmarks', or 'landmarks' and "
+                f"'grid' alone (or all rows with 'grid' alone), got {describe(wanted)}"
+            )
+        try:
+            problem = self.engine.find_problem(wanted)
+        except ValueError as error:
+            raise ValueError(f"options[{row}]: {error}") from error
+        if problem is None:
+            raise ValueError(f"options[{row}] must fix the landmarks, got {describe(wanted)}")
+        return problem
 
     def reset(self) -> NDArray[np.float32]:
         """Start an episode in every row; return the observations, shape (B, ...).
@@ -156,6 +167,7 @@ class MappSb3VecEnv(RowsVecEnv):
         """
         observations, infos = self.engine.reset(seed=self._seed, options=self._next_options)
         self._masks = infos["action_mask"]
+        self.reset_infos = self._fresh_infos(infos.get("grid"))
         self._seed, self._next_options = None, None
         self._returns[:] = 0.0
         self._lengths[:] = 0
@@ -178,15 +190,21 @@ class MappSb3VecEnv(RowsVecEnv):
         self._masks = transition.masks
         self._returns += transition.rewards
         self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = self._fresh_infos(transition.played_grids)
         if len(transition.ended):
             last = self._last_infos(transition)
             for index, info in zip(transition.ended.tolist(), last, strict=True):
-                infos[index] = info
+                infos[index].update(info)
             self._returns[transition.ended] = 0.0
             self._lengths[transition.ended] = 0
         rewards = transition.rewards.astype(np.float32)
         return transition.observations, rewards, transition.dones, infos
+
+    def _fresh_infos(self, grids: NDArray[np.int64] | None) -> list[dict[str, Any]]:
+        """Return a dict for each row, with the number of its grid, (B,), if there is a pool."""
+        if grids is None:
+            return [{} for _ in range(self.num_envs)]
+        return [{"grid": grid} for grid in grids.tolist()]
 
     def _last_infos(self, transition: Transition) -> list[dict[str, Any]]:
         """Return the infos of the rows that have ended."""

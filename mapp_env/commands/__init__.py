@@ -10,18 +10,19 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import re
 import sys
 from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
 from mapp_env import __version__
-from mapp_env.commands import info, render, solve, universe
+from mapp_env.commands import evaluate, info, render, solve, universe
 from mapp_env.commands.reports import OutputError
 
 __all__ = ["COMMANDS", "main"]
 
-COMMANDS: tuple[ModuleType, ...] = (solve, render, universe, info)
+COMMANDS: tuple[ModuleType, ...] = (solve, render, evaluate, universe, info)
 PROGRAM = "mapp"  # of the console script
 REFUSED = 2  # exit status of what cannot be done, as of argparse
 INTERRUPTED = 130
@@ -84,8 +85,10 @@ def _refuse(message: str) -> int:
 
 def _name_option(message: str, arguments: argparse.Namespace) -> str:
     """Return a message of the package, "n_agents must be ...", for the option."""
-    name, must, rest = message.partition(" must ")
-    return f"--{name.replace('_', '-')}{must}{rest}" if must and name in arguments else message
+    found = re.match(r"\w+(?= must | cannot )", message)
+    if found is None or found[0] not in arguments:
+        return message
+    return f"--{found[0].replace('_', '-')}{message[found.end() :]}"
 
 
 def _drop_output() -> None:

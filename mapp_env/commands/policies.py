@@ -6,31 +6,58 @@ a policy is asked for; by default it is that of the baselines that are developed
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import importlib
 import os
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mapp_env.envs.central_env import CentralEnv
-from mapp_env.grid import Grid, tell_apart
+from mapp_env.engine.observation import Observation
+from mapp_env.evaluation.episodes import play_episodes
+from mapp_env.evaluation.policies import Policy, refusing
+from mapp_env.evaluation.problems import group_problems
 from mapp_env.plans.plan import Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
 DEFAULT_LOADER = "baselines.policy:load_policy"
+OBSERVATIONS = tuple(kind.name.lower() for kind in Observation)
 
 
-class Policy(Protocol):
-    """What a loader returns; with a ``grid`` if it was trained on just one."""
+def add_policy_options(parser: argparse.ArgumentParser, required: bool = True) -> None:
+    """Add the options that say who plays, and what it sees; those not given are ``None``."""
+    add = parser.add_argument
+    note = "" if required else "in place of a plan: "
+    add(
+        "--policy",
+        required=required,
+        metavar="NAME",
+        help=f"{note}a trained policy that plays, by its name or run folder",
+    )
+    add(
+        "--policy-loader",
+        metavar="MODULE:FUNCTION",
+        help="what turns the name into something with act(observations (B, ...)) -> actions "
+        f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
+    )
+    add(
+        "--observation",
+        choices=OBSERVATIONS,
+        help=f"what the policy sees (default {OBSERVATIONS[0]}: (B, N + 2K))",
+    )
 
-    def act(self, observations: NDArray[np.float32], /) -> Any:
-        """Return actions (B, N) for global observations (B, N + 2K)."""
+
+def policy_of(arguments: argparse.Namespace) -> Policy:
+    """Return the policy that the options name; see :func:`load_policy`."""
+    return load_policy(arguments.policy, arguments.policy_loader or DEFAULT_LOADER)
+
+
+def environment_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of the environment that the options tell."""
+    return {"observation": arguments.observation or OBSERVATIONS[0]}
 
 
 def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
@@ -48,7 +75,7 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
     own = loader == DEFAULT_LOADER
     with contextlib.nullcontext() if own else _working_folder_last():
         try:
-            with _refusing(
+            with refusing(
                 f"--policy-loader {loader} cannot be imported", ImportError, AttributeError
             ):
                 load = getattr(importlib.import_module(module), function)
@@ -57,25 +84,13 @@ def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:
             raise ImportError(
                 f"policies are loaded by {loader}, but: {error}{hint if own else ''}"
             ) from error
-        with _refusing(f"--policy {describe(name)}: {loader} refuses it"):
+        with refusing(f"--policy {describe(name)}: {loader} refuses it"):
             policy: Policy = load(name)
     if not callable(getattr(policy, "act", None)):
         raise ValueError(
             f"--policy-loader must return something with act(), {loader} returns {describe(policy)}"
         )
     return policy
-
-
-@contextlib.contextmanager
-def _refusing(what: str, *others: type[Exception]) -> Iterator[None]:
-    """Say that a loader or a policy fails, whatever it raises: the fault is not ours."""
-    try:
-        yield
-    except others:
-        raise
-    except Exception as error:
-        reason = str(error) if isinstance(error, ValueError) else repr(error)
-        raise ValueError(f"{what}: {reason}") from error
 
 
 @contextlib.contextmanager
@@ -96,33 +111,14 @@ def _working_folder_last() -> Iterator[None]:
             sys.path.remove(folder)
 
 
-def play_policy(policy: Policy, problem: Problem, max_cycles: int) -> Plan:
+def play_policy(
+    policy: Policy, problem: Problem, max_cycles: int, environment: dict[str, Any]
+) -> Plan:
     """Return what the rules make of a policy's episode.
 
-    Raises a ValueError if the policy was trained on another grid, cannot play such a problem, or
-    its actions are none.
+    ``environment`` is as :func:`environment_of` gives it. Raises a ValueError if the policy was
+    trained on another grid, cannot play such a problem, or its actions are none.
     """
-    with _refusing("--policy cannot play this problem"):
-        grid = getattr(policy, "grid", None)  # one that names none plays on any
-    if isinstance(grid, Grid) and grid != problem.grid:
-        raise ValueError(
-            "--policy cannot play this problem: it must be for this grid, or for any, and is for "
-            f"another grid; here {tell_apart(problem.grid, grid)}"
-        )
-    env = CentralEnv(
-        problem.grid, problem.n_agents, len(problem.landmarks), max_cycles, central_action="multi"
-    )
-    observation, _ = env.reset(seed=0, options={"landmarks": problem.landmarks})
-    actions, over = [], False
-    while not over:
-        with _refusing("--policy cannot play this problem"):
-            found = np.asarray(policy.act(observation[None]))
-        if found.shape != (1, problem.n_agents) or found.dtype.kind not in "iu":
-            raise ValueError(
-                f"--policy must act with integers of shape (1, {problem.n_agents}), got shape "
-                f"{found.shape}, dtype {found.dtype}"
-            )
-        actions.append(found[0].astype(np.int64))
-        observation, _, terminated, truncated, _ = env.step(actions[-1])
-        over = terminated or truncated
-    return replay(replace(problem, max_cycles=max_cycles), np.array(actions))
+    (group,) = group_problems([problem], [max_cycles])
+    episodes = play_episodes(policy, group, environment, n_kept=1)
+    return replay(replace(problem, max_cycles=max_cycles), episodes.actions[: episodes.steps[0], 0])

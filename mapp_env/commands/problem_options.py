@@ -5,16 +5,19 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from collections.abc import Sequence
+
+import numpy as np
 
 from mapp_env.grid import Grid
 from mapp_env.grids import generator_names, grid_names, make_grid
-from mapp_env.problem import Problem, sample_problems
+from mapp_env.problem import MAX_LANDMARKS, Problem, draw_landmarks, sample_problems
 from mapp_env.validation import check_count, describe
 
 MAX_DRAWN = 2**63 - 1  # largest seed of what is drawn
 GRID, N_LANDMARKS, N_AGENTS = "paper-7x7", 5, 3
 GRID_OPTIONS = ("grid", "depot", "rows", "cols", "grid_seed")
-OPTIONS = ("problem", *GRID_OPTIONS, "landmarks", "n_landmarks", "n_agents")
+OPTIONS = ("problem", *GRID_OPTIONS, "landmarks", "n_landmarks", "n_agents", "starts")
 
 
 def add_grid_options(group: argparse._ArgumentGroup) -> None:
@@ -56,7 +59,19 @@ def add_problem_options(parser: argparse.ArgumentParser) -> None:
         help="their cells, as numbers (row * columns + column) or ROW,COL (default: drawn)",
     )
     add("--n-landmarks", type=int, metavar="K", help=f"how many to draw (default {N_LANDMARKS})")
-    add("--n-agents", type=int, metavar="N", help=f"default {N_AGENTS}")
+    add(
+        "--n-agents",
+        type=int,
+        metavar="N",
+        help=f"default {N_AGENTS}, or as many as there are starts",
+    )
+    add(
+        "--starts",
+        nargs="+",
+        type=_cell,
+        metavar="CELL",
+        help="where each agent stands at first, written as landmarks are (default: on the depot)",
+    )
     add("--seed", type=int, metavar="S", help="of all that is drawn, but for the grid (default 0)")
 
 
@@ -69,15 +84,28 @@ def problem_of(arguments: argparse.Namespace) -> Problem:
         except ValueError as error:
             raise ValueError(f"--problem {error}") from error
     grid = grid_of(arguments)
-    n_agents = N_AGENTS if arguments.n_agents is None else arguments.n_agents
-    landmarks = arguments.landmarks
+    starts, n_agents, landmarks = arguments.starts, arguments.n_agents, arguments.landmarks
+    if n_agents is None:
+        n_agents = N_AGENTS if starts is None else len(starts)
     if landmarks is None:
         count = N_LANDMARKS if arguments.n_landmarks is None else arguments.n_landmarks
-        seed = seed_of(arguments)
-        landmarks = sample_problems(grid, 1, n_landmarks=count, seed=seed)[0].tolist()
+        landmarks = _draw(grid, count, seed_of(arguments), starts)
     elif arguments.n_landmarks is not None:
         raise ValueError("--n-landmarks is how many to draw: it does not go with --landmarks")
-    return Problem(grid, landmarks, n_agents)
+    return Problem(grid, landmarks, n_agents, starts=starts)
+
+
+def _draw(grid: Grid, count: int, seed: int, starts: Sequence[object] | None) -> list[int]:
+    """Return drawn landmarks, none of them a start; raise ValueError if there is no room."""
+    if starts is None:
+        return list(map(int, sample_problems(grid, 1, n_landmarks=count, seed=seed)[0]))
+    taken = [grid.cell(f"starts[{index}]", cell) for index, cell in enumerate(starts)]
+    candidates = np.setdiff1d(grid.reachable, np.array(taken, np.int32))
+    count = check_count("--n-landmarks", count, 1, min(len(candidates), MAX_LANDMARKS))
+    landmarks = np.empty(count, np.int32)
+    word = np.random.default_rng(seed).integers(2**64, dtype=np.uint64)
+    draw_landmarks(word, candidates, landmarks)
+    return list(map(int, landmarks))
 
 
 def seed_of(arguments: argparse.Namespace) -> int:

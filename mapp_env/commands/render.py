@@ -24,7 +24,12 @@ from gymnasium.utils import seeding
 
 from mapp_env.commands import problem_options, reports
 from mapp_env.commands.pictures import DEFAULT_FPS, PICTURES, picture_writer
-from mapp_env.commands.policies import DEFAULT_LOADER, load_policy, play_policy
+from mapp_env.commands.policies import (
+    add_policy_options,
+    environment_of,
+    play_policy,
+    policy_of,
+)
 from mapp_env.plans.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
 from mapp_env.solvers import solve
@@ -49,13 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="what is played: optimum (proven up to 20 landmarks, else the best found), random, "
         "or a plan file, which brings its problem along (default optimum)",
     )
-    add("--policy", metavar="NAME", help="in place of a plan: a trained policy that plays")
-    add(
-        "--policy-loader",
-        metavar="MODULE:FUNCTION",
-        help="what turns the name into something with act(observations (B, N + 2K)) -> actions "
-        f"(B, N) (default {DEFAULT_LOADER}, from an editable installation)",
-    )
+    add_policy_options(parser, required=False)
     add("--objective", choices=OBJECTIVES, help="what the optimum minimises (default cover_time)")
     add(
         "--max-cycles",
@@ -80,8 +79,11 @@ def run(arguments: argparse.Namespace) -> None:
     problem, plan = _plan_of(arguments)
     size = draw(problem, plan)
     record = {"out": arguments.out, "bytes": size, "landmarks": list(problem.landmarks)}
+    if problem.starts is not None:
+        record["starts"] = list(problem.starts)
     wrote = f"wrote {arguments.out}: {size} bytes"
     lines = [wrote, reports.costs_line(problem, plan), reports.landmarks_line(problem)]
+    lines += reports.starts_lines(problem)
     reports.print_report(arguments, {**record, **reports.costs_record(plan)}, lines)
 
 
@@ -94,8 +96,9 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
         raise ValueError("--objective is for --plan optimum")
     if arguments.max_cycles is not None and source not in ("random", "policy"):
         raise ValueError("--max-cycles is for --plan random and --policy")
-    if arguments.policy_loader is not None and source != "policy":
-        raise ValueError("--policy-loader is for --policy")
+    for name in ("policy_loader", "observation"):
+        if getattr(arguments, name) is not None and source != "policy":
+            raise ValueError(f"--{name.replace('_', '-')} is for --policy")
     if source not in ("optimum", "random", "policy"):
         return _read_plan(arguments, source)
     problem = problem_options.problem_of(arguments)
@@ -105,8 +108,8 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
     limit = STEPS if arguments.max_cycles is None else arguments.max_cycles
     limit = check_count("--max-cycles", limit, 1, MAX_STEPS)
     if source == "policy":
-        policy = load_policy(arguments.policy, arguments.policy_loader or DEFAULT_LOADER)
-        return problem, play_policy(policy, problem, limit)
+        environment = environment_of(arguments)
+        return problem, play_policy(policy_of(arguments), problem, limit, environment)
     problem = replace(problem, max_cycles=limit)
     generator, _ = seeding.np_random(seed)
     return problem, replay(problem, generator.integers(0, 4, (limit, problem.n_agents)))

@@ -63,6 +63,13 @@ def landmarks_line(problem: Problem) -> str:
     return f"landmarks: {' '.join(map(str, problem.landmarks))}"
 
 
+def starts_lines(problem: Problem) -> list[str]:
+    """Return the agents' first cells in a line; none if they all start on the depot."""
+    if set(problem.start_cells) == {problem.grid.depot}:
+        return []
+    return [f"starts: {' '.join(map(str, problem.start_cells))}"]
+
+
 def costs_record(plan: Plan) -> dict[str, Any]:
     """Return the same for programs; a cost that is infinite is null."""
     return {

@@ -7,6 +7,8 @@ For example:
     python -m mapp_env solve --objective makespan --picture routes.png --out plan.json
   a map of one's own, landmarks by row and column
     python -m mapp_env solve --grid office.map --landmarks 3,4 10,2 --n-agents 2
+  agents in the middle of an episode: where each stands, and the landmarks that are left
+    python -m mapp_env solve --starts 27 5,2 --landmarks 0 6 48
   sixty landmarks of a warehouse, with a second to search
     python -m mapp_env solve --grid warehouse --n-landmarks 60 --time-limit 1
 """
@@ -17,8 +19,15 @@ import argparse
 
 from mapp_env.commands.pictures import PICTURES, check_file, picture_writer
 from mapp_env.commands.problem_options import add_problem_options, problem_of, seed_of
-from mapp_env.commands.reports import add_json_option, costs_line, landmarks_line, print_report
-from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.commands.reports import (
+    add_json_option,
+    costs_line,
+    landmarks_line,
+    print_report,
+    starts_lines,
+)
+from mapp_env.plans.plan import OBJECTIVES, Plan
+from mapp_env.problem import Problem
 from mapp_env.records import MAX_PLAN_BYTES, labelled, write_record
 from mapp_env.solvers import METHODS, solve
 
@@ -59,6 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
             raise ValueError("--picture must be another file than --out")
         draw = picture_writer("--picture", arguments.picture)
     problem = problem_of(arguments)
+    n_agents = problem.n_agents
     options = (arguments.objective, arguments.method, arguments.time_limit)
     plan = solve(problem, *options, seed_of(arguments))
     # A plan longer than a file holds can still be printed and drawn.
@@ -70,11 +80,15 @@ def run(arguments: argparse.Namespace) -> None:
     lines = [
         costs_line(problem, plan),
         landmarks_line(problem),
-        *(
-            f"agent {agent}: {' '.join(map(str, tour)) or 'stays at the depot'}"
-            for agent, tour in enumerate(plan.tours)
-        ),
+        *starts_lines(problem),
+        *(f"agent {agent}: {_tour_in_words(problem, plan, agent)}" for agent in range(n_agents)),
         f"by {plan.solver} in {1000 * plan.seconds:.1f} ms",
         *(f"wrote {name}" for name in (arguments.out, arguments.picture) if name is not None),
     ]
     print_report(arguments, labelled("plan", record), lines)
+
+
+def _tour_in_words(problem: Problem, plan: Plan, agent: int) -> str:
+    at_depot = problem.start_cells[agent] == problem.grid.depot
+    stays = f"stays at {'the depot' if at_depot else 'its start'}"
+    return " ".join(map(str, plan.tours[agent])) or stays

@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.engine.observation import observe_row
 from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
-from mapp_env.engine.state import Packed, World, new_rows, split, split_row, world_at
+from mapp_env.engine.state import (
+    Packed,
+    World,
+    is_plain,
+    new_rows,
+    pack,
+    split,
+    split_row,
+    unpack,
+    world_at,
+)
 from mapp_env.grid import fill_distances
 
 # Arrays, for signatures of one line.
@@ -33,7 +43,7 @@ def step_and_observe(
     Raises a ValueError unless there is exactly one valid action per agent; nothing has moved then.
     (The rules index a table with actions: an invalid one would read outside of it.)
     """
-    own = world_at(World(*world), row, 0)
+    own = world_at(unpack(world), row, 0)
     if actions.shape[0] != own.n_agents:
         raise ValueError("actions must hold one action per agent")
     for agent in range(own.n_agents):
@@ -61,18 +71,38 @@ def step_rows(
 
     Shapes: (B, ...) of what ``step_row`` and ``observe_row`` take.
     """
-    common = World(*world)
-    for index in range(rows.shape[0]):
-        own = world_at(common, rows[index], index)
-        if skip[index]:
-            rewards[index] = 0.0
-            terminations[index] = False
-            truncations[index] = False
-        else:
-            rewards[index], terminations[index], truncations[index] = step_row(
-                rows[index], actions[index], limits[index], own
-            )
-        observe_row(rows[index], own, views[index], masks[index])
+    common = unpack(world)
+    out = rewards, terminations, truncations, views, masks
+    if is_plain(common):
+        for index in range(rows.shape[0]):
+            own = world_at(common, rows[index], index, True)
+            _step_at(index, rows, actions, skip, limits, out, own)
+    else:
+        for index in range(rows.shape[0]):
+            own = world_at(common, rows[index], index)
+            _step_at(index, rows, actions, skip, limits, out, own)
+
+
+@kernel
+def _step_at(
+    index: int,
+    rows: Int32s,
+    actions: Int64s,
+    skip: Bools,
+    limits: Int64s,
+    out: tuple[Float64s, Bools, Bools, Float32s, Int8s],
+    world: World,
+) -> None:
+    rewards, terminations, truncations, views, masks = out
+    if skip[index]:
+        rewards[index] = 0.0
+        terminations[index] = False
+        truncations[index] = False
+    else:
+        rewards[index], terminations[index], truncations[index] = step_row(
+            rows[index], actions[index], limits[index], world
+        )
+    observe_row(rows[index], world, views[index], masks[index])
 
 
 @kernel
@@ -80,7 +110,7 @@ def observe_rows(
     rows: Int32s, indices: Int64s, views: Float32s, masks: Int8s, world: Packed
 ) -> None:
     """Observe the rows of ``indices``, (M,): theirs in ``views`` (B, V, F), ``masks`` (B, N, A)."""
-    common = World(*world)
+    common = unpack(world)
     for index in indices:
         own = world_at(common, rows[index], index)
         observe_row(rows[index], own, views[index], masks[index])
@@ -93,22 +123,29 @@ def reset_rows(
     grids: Int64s,
     landmarks: Int32s,
     cells: Int32s,
+    limits: Int64s,
+    row_limits: Int64s,
+    max_cycles: int,
+    longest: int,
     world: Packed,
 ) -> None:
     """Start an episode in the rows of ``indices``, (M,).
 
     It is on the grids of these numbers, (M,), and on ``landmarks``, (M, K), with the agents on
-    ``cells``, (M, N).
+    ``cells``, (M, N). Its step limit, of ``row_limits``, (B,), is that of ``limits``, (M,), or
+    ``max_cycles`` for a negative one, and never more than ``longest``.
     """
-    common = World(*world)
+    common = unpack(world)
     for place, index in enumerate(indices):
         reset_row(rows[index], landmarks[place], cells[place], common, grids[place])
+        limit = limits[place] if limits[place] >= 0 else max_cycles
+        row_limits[index] = min(limit, longest)
 
 
 @kernel
 def measure_rows(rows: Int32s, indices: Int64s, costs: Float64s, world: Packed) -> None:
     """Write the costs of some rows, (M, 3): cover time, makespan, total distance (R8)."""
-    common = World(*world)
+    common = unpack(world)
     for place, index in enumerate(indices):
         own = world_at(common, rows[index], index)
         cover_time, makespan, distance = measure_row(rows[index], own)
@@ -130,13 +167,13 @@ def visit_rows(
     state = split(rows, world.n_agents, world.n_landmarks)
     state.cells[:], state.landmarks[:], state.visited[:] = cells, landmarks, visited
     rewards, terminated = np.empty(len(rows)), np.empty(len(rows), np.bool_)
-    _visit_rows(rows, rewards, terminated, tuple(world))
+    _visit_rows(rows, rewards, terminated, pack(world))
     return state.visited.astype(np.bool_), rewards, terminated
 
 
 @kernel
 def _visit_rows(rows: Int32s, rewards: Float64s, terminated: Bools, world: Packed) -> None:
-    common = World(*world)
+    common = unpack(world)
     for index in range(rows.shape[0]):
         state = split_row(rows[index], common.n_agents, common.n_landmarks)
         own = world_at(common, rows[index], index)
@@ -151,7 +188,7 @@ def fill_fields(
 
     Shapes: ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,), C of the largest grid.
     """
-    common = World(*world)
+    common = unpack(world)
     for index in indices:
         own = world_at(common, rows[index], index)
         state = split_row(rows[index], own.n_agents, own.n_landmarks)

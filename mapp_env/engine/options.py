@@ -2,26 +2,58 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.engine.sources import OWN_LIMIT, Problems, Source
+from mapp_env.engine.sources import NO_GRIDS, OWN_LIMIT, Problems, Source
 from mapp_env.engine.task import Task
 from mapp_env.problem import Problem, check_landmarks
 from mapp_env.validation import as_array, as_integer, describe
+
+OPTIONS = ("landmarks", "grid", "problem")
+"""What ``reset(options=...)`` knows."""
+
+BATCH_OPTIONS = (*OPTIONS, "reset_mask")
+"""What it knows in a batch."""
 
 
 class Asked(NamedTuple):
     """What ``reset(options=...)`` asks for in each row: problems, or grids to draw them on."""
 
-    grids: NDArray[np.int64] | None  # (B,)
+    grids: NDArray[np.int64]  # (B,), or NO_GRIDS
     problems: Problems | None  # of B rows
 
 
-NOTHING = Asked(None, None)
+NOTHING = Asked(NO_GRIDS, None)
+
+
+def warn_of_unknown(options: Mapping[str, Any] | None, known: Sequence[str]) -> None:
+    """Warn of options that are not ``known``: a typo would train on another task in silence.
+
+    The one that PettingZoo's own tests pass, ``{"options": 1}``, is let through.
+    """
+    given = options or {}
+    unknown = [
+        key
+        for key, value in given.items()
+        if key not in known and not (key == "options" and type(value) is int)
+    ]
+    if not unknown:
+        return
+    named = [key for key in unknown[:8] if isinstance(key, str)]
+    meant = dict.fromkeys(near for key in named for near in get_close_matches(key, known))
+    hint = f" (did you mean {' or '.join(map(repr, meant))}?)" if meant else ""
+    warnings.warn(
+        f"options of reset() that are unknown are ignored: {', '.join(map(describe, unknown[:8]))}"
+        f"{hint}; known are {', '.join(map(repr, known))}",
+        UserWarning,
+        stacklevel=3,
+    )
 
 
 def check_options(source: Source, task: Task, options: Mapping[str, Any] | None) -> Asked:
@@ -29,7 +61,7 @@ def check_options(source: Source, task: Task, options: Mapping[str, Any] | None)
 
     ``"landmarks"`` holds cells or (row, col) pairs; ``"grid"`` the number of a grid of the pool,
     and without landmarks they are drawn on it; ``"problem"`` a whole problem on one of the task's
-    grids with as many agents and landmarks. Other keys are ignored.
+    grids with as many agents and landmarks. Other keys are not looked at.
 
     Raises a ValueError if the options are invalid.
     """
@@ -39,14 +71,14 @@ def check_options(source: Source, task: Task, options: Mapping[str, Any] | None)
     problem, landmarks, grid = (options.get(name) for name in ("problem", "landmarks", "grid"))
     _check_alone(problem, landmarks, grid)
     if problem is not None:
-        return Asked(None, stack_problems(task, [problem], ["options['problem']"]))
+        return Asked(NO_GRIDS, stack_problems(task, [problem], ["options['problem']"]))
     index = None if grid is None else check_grid_number(task, grid)
     if landmarks is None:
         return NOTHING if index is None else Asked(np.array([index]), None)
     index = _the_grid(task, index)
     name = "options['landmarks']"
     cells = check_landmarks(task.grids[index], landmarks, task.n_landmarks, name)
-    return Asked(None, source.place(np.array([index]), np.array([cells], np.int32)))
+    return Asked(NO_GRIDS, source.place(np.array([index]), np.array([cells], np.int32)))
 
 
 def check_problems(
@@ -71,12 +103,12 @@ def check_problems(
                 f"row; got {len(problem)}"
             )
         names = [f"options['problem'][{row}]" for row in range(n_rows)]
-        return Asked(None, stack_problems(task, problem, names))
+        return Asked(NO_GRIDS, stack_problems(task, problem, names))
     by_row = isinstance(landmarks, np.ndarray) and _is_by_row(task, landmarks, n_rows)
     if not by_row and not isinstance(grid, Sequence | np.ndarray):
         asked = check_options(source, task, options)
         rows = np.zeros(n_rows, np.int64)
-        grids = None if asked.grids is None else asked.grids[rows]
+        grids = asked.grids.repeat(n_rows)
         return Asked(grids, None if asked.problems is None else asked.problems.take(rows))
     if grid is None:
         grids = np.full(n_rows, _the_grid(task, None))
@@ -85,13 +117,13 @@ def check_problems(
     if landmarks is None:
         return Asked(grids, None)
     if by_row:
-        return Asked(None, source.place(grids, _check_rows(landmarks, task, grids)))
+        return Asked(NO_GRIDS, source.place(grids, _check_rows(landmarks, task, grids)))
     name = "options['landmarks']"
     cells = [
         check_landmarks(task.grids[index], landmarks, task.n_landmarks, f"{name} on grid {index}")
         for index in grids.tolist()
     ]
-    return Asked(None, source.place(grids, np.array(cells, np.int32)))
+    return Asked(NO_GRIDS, source.place(grids, np.array(cells, np.int32)))
 
 
 def check_reset_mask(options: Mapping[str, Any] | None, n_rows: int) -> NDArray[np.bool_]:

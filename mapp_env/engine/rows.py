@@ -17,8 +17,8 @@ from mapp_env.engine.loops import (
     step_rows,
 )
 from mapp_env.engine.scene import TRAIL_MOVES, Scene
-from mapp_env.engine.sources import OWN_LIMIT, Problems
-from mapp_env.engine.state import new_rows, split
+from mapp_env.engine.sources import Problems
+from mapp_env.engine.state import new_rows, pack, split
 from mapp_env.engine.task import Task
 from mapp_env.problem import MAX_CYCLES
 
@@ -33,7 +33,7 @@ class Rows:
     def __init__(self, task: Task, n_rows: int, n_views: int) -> None:
         self.task = task
         self.n_rows = n_rows
-        self.array = new_rows(n_rows, task.n_agents, task.n_landmarks)
+        self.array = new_rows(n_rows, task.n_agents, task.n_landmarks, len(task.grids))
         self.limits = np.full(n_rows, task.max_cycles, np.int64)  # of each row's episode
         self.max_cycles = task.max_cycles  # of the episodes to come that do not bring their own
         self.longest = MAX_CYCLES  # upper bound of every step limit, whoever sets it
@@ -52,7 +52,7 @@ class Rows:
     def _bind(self) -> None:
         """Gather what is read at every step: for a single row, to look it up would take longer."""
         self.state = split(self.array, self.task.n_agents, self.task.n_landmarks)
-        self.world = tuple(self.task.world(self._fields))
+        self.world = pack(self.task.world(self._fields))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy; what the kernels read must be views of it, not copies of views."""
@@ -64,16 +64,21 @@ class Rows:
 
         A problem that does not bring a step limit has ``max_cycles``.
         """
-        reset_rows(self.array, indices, *problems[:3], self.world)
+        limits = self.limits, self.max_cycles, self.longest
+        reset_rows(self.array, indices, *problems, *limits, self.world)
         if len(self._fields):
             queue = np.empty(self.task.largest, np.int32)
             fill_fields(self.array, indices, self._fields, queue, self.world)
-        limits = np.where(problems.limits == OWN_LIMIT, self.max_cycles, problems.limits)
-        self.limits[indices] = np.minimum(limits, self.longest)
         if self._trails is not None:
             for index in indices:
                 self._trails[index].clear()
             self.extend_trails(indices)
+
+    @property
+    def grids(self) -> NDArray[np.int64]:
+        """The number of the grid that each row's episode is on, fresh, shape (B,)."""
+        column = self.state.grid.astype(np.int64)
+        return column[:, 0] if column.size else np.zeros(self.n_rows, np.int64)
 
     def find_bad_action(self, actions: NDArray[np.int64]) -> int:
         """Return the position of the first action, shape (B, N), that is none, or -1.
@@ -155,7 +160,7 @@ class Rows:
         cells = tuple(state.cells[index].tolist())
         trail = [cells] if self._trails is None else self._trails[index]
         return Scene(
-            grid=self.task.grids[state.grid[index, 0]],
+            grid=self.task.grids[self.grids[index]],
             landmarks=tuple(state.landmarks[index].tolist()),
             visited=tuple(state.visited[index].astype(bool).tolist()),
             cells=cells,

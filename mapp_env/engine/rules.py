@@ -76,7 +76,7 @@ def reset_row(
     """
     row[:] = 0
     state = split_row(row, world.n_agents, world.n_landmarks)
-    state.grid[0] = grid
+    state.grid[:] = grid
     for agent in range(world.n_agents):
         state.cells[agent] = cells[agent]
     for landmark in range(world.n_landmarks):

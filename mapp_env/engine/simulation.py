@@ -103,7 +103,7 @@ class Simulation:
     @property
     def grid(self) -> int:
         """Which of the task's grids the episode is on."""
-        return int(self._rows.state.grid[0, 0])
+        return int(self._rows.grids[0])
 
     def metrics(self) -> dict[str, bool | float]:
         """Return success and the three costs of the episode (R8), inf if it was not solved."""

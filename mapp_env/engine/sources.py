@@ -12,6 +12,7 @@ from mapp_env.engine.task import Task
 from mapp_env.problem import LOW_32_BITS, draw_landmarks, scramble
 
 OWN_LIMIT = -1  # of an episode that has the environment's step limit
+NO_GRIDS = np.zeros(0, np.int64)  # wanted: they are drawn
 
 
 class Problems(NamedTuple):
@@ -38,13 +39,17 @@ class Source:
         self._firsts = np.cumsum([0, *(len(room) for room in rooms)])
         self._depots = np.array([grid.depot for grid in task.grids], np.int32)
 
-    def draw(self, words: NDArray[np.uint64], grids: NDArray[np.int64] | None = None) -> Problems:
+    def draw(self, words: NDArray[np.uint64], grids: NDArray[np.int64] = NO_GRIDS) -> Problems:
         """Return a problem for each random word, (M,), on a grid drawn with it, or on ``grids``."""
         task, n_rows = self._task, len(words)
-        landmarks = np.empty((n_rows, task.n_landmarks), np.int32)
-        grids = np.full(n_rows, -1) if grids is None else grids.copy()
-        _draw_rows(words, self._firsts, self._candidates, grids, landmarks)
-        return self.place(grids, landmarks)
+        problems = Problems(
+            np.empty(n_rows, np.int64),
+            np.empty((n_rows, task.n_landmarks), np.int32),
+            np.empty((n_rows, task.n_agents), np.int32),
+            np.empty(n_rows, np.int64),
+        )
+        _draw_rows(words, grids, self._firsts, self._candidates, self._depots, *problems)
+        return problems
 
     def place(self, grids: NDArray[np.int64], landmarks: NDArray[np.int32]) -> Problems:
         """Return problems on landmarks, (M, K), of grids, (M,), in which all start on the depot."""
@@ -55,17 +60,26 @@ class Source:
 @kernel
 def _draw_rows(
     words: NDArray[np.uint64],
+    wanted: NDArray[np.int64],
     firsts: NDArray[np.int64],
     candidates: NDArray[np.int32],
+    depots: NDArray[np.int32],
     grids: NDArray[np.int64],
     landmarks: NDArray[np.int32],
+    cells: NDArray[np.int32],
+    limits: NDArray[np.int64],
 ) -> None:
-    """Draw a grid where it is negative, and landmarks; ``firsts`` (G + 1,) part the candidates."""
+    """Fill in problems, on the ``wanted`` grids, (M,), or if there are none on grids drawn.
+
+    ``firsts``, (G + 1,), part the ``candidates`` of all grids; ``depots`` are (G,).
+    """
     for row, word in enumerate(words):
-        if grids[row] < 0:
-            grids[row] = draw_grid(word, firsts.shape[0] - 1)
-        first, end = firsts[grids[row]], firsts[grids[row] + 1]
-        draw_landmarks(word, candidates[first:end], landmarks[row])
+        grid = wanted[row] if wanted.shape[0] else draw_grid(word, depots.shape[0])
+        draw_landmarks(word, candidates[firsts[grid] : firsts[grid + 1]], landmarks[row])
+        grids[row] = grid
+        for agent in range(cells.shape[1]):
+            cells[row, agent] = depots[grid]
+        limits[row] = OWN_LIMIT
 
 
 @kernel

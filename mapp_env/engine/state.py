@@ -38,8 +38,9 @@ NO_DISTANCES.flags.writeable = False
 
 
 Packed = tuple[Any, ...]
-"""``tuple(world)``: numba recognises it in a fifth of the time that a NamedTuple takes, so that is
-what Python hands to kernels; they begin with ``World(*world)``."""
+"""A world as Python hands it to kernels, made by :func:`pack`: numba recognises a plain tuple in a
+fifth of the time that a NamedTuple takes, and one array sooner than eight numbers. Kernels begin
+with :func:`unpack`."""
 
 
 class World(NamedTuple):
@@ -51,12 +52,37 @@ class World(NamedTuple):
     observation: int  # an Observation
     actions: int  # MOVES or LANDMARKS
     return_home: int  # 1 if the team walks home (R12), else 0
+    first_field: int  # line of the first landmark in distances, ALL_PAIRS or BY_COORDINATES
+    first_path: int  # line of the first landmark in paths, or ALL_PAIRS
     grids: NDArray[np.int32]  # (G, 4): first line in table, cells C, depot, columns of the widest
     table: NDArray[np.int32]  # (sum of C, 10), from cell_table, grid after grid; cells are local
     distances: NDArray[np.int32]  # (S, C), from sources to cells: the reward's
-    first_field: int  # line of the first landmark, ALL_PAIRS or BY_COORDINATES
     paths: NDArray[np.int32]  # (S, C), shortest paths: the observation's and the actions'
-    first_path: int  # line of the first landmark, or ALL_PAIRS
+
+
+def pack(world: World) -> Packed:
+    """Return a world as kernels take it."""
+    return (np.array(world[:8], np.int64), *world[8:])
+
+
+@kernel
+def unpack(packed: Packed) -> World:
+    """Return the world that was packed."""
+    numbers, grids, table, distances, paths = packed
+    return World(
+        numbers[0],
+        numbers[1],
+        numbers[2],
+        numbers[3],
+        numbers[4],
+        numbers[5],
+        numbers[6],
+        numbers[7],
+        grids,
+        table,
+        distances,
+        paths,
+    )
 
 
 class State(NamedTuple):
@@ -67,11 +93,11 @@ class State(NamedTuple):
     visited: NDArray[np.int32]  # (K,), 0 or 1
     head: NDArray[np.int32]  # (N + 2K,), the three together: the global observation (R9)
     step: NDArray[np.int32]  # (1,), steps since the reset
-    grid: NDArray[np.int32]  # (1,), which of the world's grids the episode is on
     moved: NDArray[np.int32]  # (N,), cells moved by each agent
     claim_cells: NDArray[np.int32]  # (N,), where each agent made its last claim
     claim_moved: NDArray[np.int32]  # (N,), cells it had moved by then
     claim_steps: NDArray[np.int32]  # (N,), at which step; 0 without a claim
+    grid: NDArray[np.int32]  # (1,), which of several grids the episode is on; (0,) if there is one
 
 
 def state_length(n_agents: int, n_landmarks: int) -> int:
@@ -79,31 +105,35 @@ def state_length(n_agents: int, n_landmarks: int) -> int:
     return n_agents + 2 * n_landmarks
 
 
-def new_rows(n_rows: int, n_agents: int, n_landmarks: int) -> NDArray[np.int32]:
-    """Return B rows of zeros, shape (B, N + 2K + 2 + 4N)."""
-    return np.zeros((n_rows, state_length(n_agents, n_landmarks) + 2 + 4 * n_agents), np.int32)
+def new_rows(n_rows: int, n_agents: int, n_landmarks: int, n_grids: int = 1) -> NDArray[np.int32]:
+    """Return B rows of zeros, shape (B, N + 2K + 1 + 4N), or one more if there are several grids.
+
+    (An entry more in each row would cost a batch on one grid a thirtieth of its speed.)
+    """
+    length = state_length(n_agents, n_landmarks) + 1 + 4 * n_agents + (n_grids > 1)
+    return np.zeros((n_rows, length), np.int32)
 
 
 def split(rows: NDArray[Any], n_agents: int, n_landmarks: int) -> State:
     """Return the parts of a row, or of many rows, last axis first to last entry."""
     visited = n_agents + n_landmarks
     step = visited + n_landmarks
-    grid = step + 1
-    moved = grid + 1
+    moved = step + 1
     claim_cells = moved + n_agents
     claim_moved = claim_cells + n_agents
     claim_steps = claim_moved + n_agents
+    grid = claim_steps + n_agents
     return State(
         cells=rows[..., :n_agents],
         landmarks=rows[..., n_agents:visited],
         visited=rows[..., visited:step],
         head=rows[..., :step],
-        step=rows[..., step:grid],
-        grid=rows[..., grid:moved],
+        step=rows[..., step:moved],
         moved=rows[..., moved:claim_cells],
         claim_cells=rows[..., claim_cells:claim_moved],
         claim_moved=rows[..., claim_moved:claim_steps],
-        claim_steps=rows[..., claim_steps:],
+        claim_steps=rows[..., claim_steps:grid],
+        grid=rows[..., grid:],
     )
 
 
@@ -112,13 +142,23 @@ split_row = kernel(split)
 
 
 @kernel
-def world_at(world: World, row: NDArray[np.int32], index: int) -> World:
+def is_plain(world: World) -> bool:
+    """Return whether a world has one grid and neither R11 nor R12: the game of the paper."""
+    return world.grids.shape[0] == 1 and world.actions == MOVES and world.return_home == 0
+
+
+@kernel
+def world_at(world: World, row: NDArray[np.int32], index: int, plain: bool = False) -> World:
     """Return the world as a row sees it: its own grid alone, and its own K lines of fields.
 
-    ``index`` is the row's number among those that fields are kept for.
+    ``index`` is the row's number among those that fields are kept for. Where a caller writes True
+    for ``plain``, of a world that is, the compiler leaves out of its loop what else there may be.
     """
+    actions, return_home = world.actions, world.return_home
     grids, table = world.grids, world.table
-    if grids.shape[0] > 1:
+    if plain:
+        actions, return_home = MOVES, 0
+    elif grids.shape[0] > 1:
         which = split_row(row, world.n_agents, world.n_landmarks).grid[0]
         grids = grids[which : which + 1]
         table = table[grids[0, FIRST] : grids[0, FIRST] + grids[0, N_CELLS]]
@@ -128,14 +168,14 @@ def world_at(world: World, row: NDArray[np.int32], index: int) -> World:
         world.n_landmarks,
         world.reward,
         world.observation,
-        world.actions,
-        world.return_home,
+        actions,
+        return_home,
+        first if first < 0 else index * world.n_landmarks,
+        first_path if first_path < 0 else index * world.n_landmarks,
         grids,
         table,
         world.distances,
-        first if first < 0 else index * world.n_landmarks,
         world.paths,
-        first_path if first_path < 0 else index * world.n_landmarks,
     )
 
 
@@ -177,10 +217,11 @@ def cell_table(grid: Grid) -> NDArray[np.int32]:
     so that borders and walls vanish from the rules. The mask is four int8 in one word: 0 for a move
     that bumps, else 1.
     """
-    cells = np.arange(grid.n_cells)
-    row, col = np.divmod(cells, grid.cols)
-    mask = (grid.moves != cells[:, None]).view(np.int32)
-    columns: list[NDArray[Any]] = [grid.moves, cells, row, col, grid.home, grid.walls.ravel(), mask]
-    table = np.column_stack(columns).astype(np.int32)
+    cells = np.arange(grid.n_cells, dtype=np.int32)
+    table = np.empty((grid.n_cells, MASK + 1), np.int32)
+    table[:, :WAIT], table[:, WAIT] = grid.moves, cells
+    table[:, ROW], table[:, COL] = np.divmod(cells, np.int32(grid.cols))
+    table[:, HOME], table[:, WALL] = grid.home, grid.walls.ravel()
+    table[:, MASK] = (grid.moves != cells[:, None]).view(np.int32)[:, 0]
     table.flags.writeable = False
     return table

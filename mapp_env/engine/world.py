@@ -56,9 +56,10 @@ def make_world(
     table = tables[0] if len(tables) == 1 else np.concatenate(tables)
     for array in (lines, table):
         array.flags.writeable = False
-    paths = NO_DISTANCES, ALL_PAIRS
+    distances, first_field = reward_distances(reward, pool, fields)
+    paths, first_path = NO_DISTANCES, ALL_PAIRS
     if observation in PATH_OBSERVATIONS or actions == LANDMARKS:
-        paths = path_distances(pool, fields)
+        paths, first_path = path_distances(pool, fields)
     return World(
         n_agents,
         n_landmarks,
@@ -66,8 +67,10 @@ def make_world(
         int(observation),
         actions,
         int(return_home),
+        first_field,
+        first_path,
         lines,
         table,
-        *reward_distances(reward, pool, fields),
-        *paths,
+        distances,
+        paths,
     )

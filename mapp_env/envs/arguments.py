@@ -59,9 +59,9 @@ class BatchTask(CentralTask):
         super().__post_init__()
         check_choice("render_mode", self.render_mode, (None, *BATCH_RENDER_MODES))
         if not isinstance(self.autoreset_mode, AutoresetMode):
-            names = [each.value for each in AutoresetMode]
-            mode = AutoresetMode(check_choice("autoreset_mode", self.autoreset_mode, names))
-            object.__setattr__(self, "autoreset_mode", mode)
+            modes = {each.value: each for each in AutoresetMode} | dict(AutoresetMode.__members__)
+            name = check_choice("autoreset_mode", self.autoreset_mode, modes)
+            object.__setattr__(self, "autoreset_mode", modes[name])
 
 
 P = ParamSpec("P")

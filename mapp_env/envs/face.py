@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from mapp_env.engine.options import OPTIONS, warn_of_unknown
 from mapp_env.engine.simulation import Simulation
 from mapp_env.engine.task import RENDER_MODES, Task
 from mapp_env.problem import MAX_CYCLES
@@ -64,6 +65,7 @@ class Face:
         if seed is not None:
             seed = check_count("seed", seed, 0, MAX_SEED)
         asked = self._simulation.check_options(options)
+        warn_of_unknown(options, OPTIONS)
         if seed is not None:
             self._np_random, self._np_random_seed = seeding.np_random(seed)
         self._simulation.reset(asked, self.np_random)

@@ -107,7 +107,8 @@ class MappParallelEnv(Face, pettingzoo.ParallelEnv[AgentID, NDArray[np.float32],
         options : dict, optional
             ``{"landmarks": cells or (row, col) pairs}`` or ``{"problem": Problem}`` fixes the
             problem, and draws nothing from the generator. With a pool, ``"grid"`` is the number of
-            the grid that landmarks are on, given or drawn. Other keys are ignored.
+            the grid that landmarks are on, given or drawn. Other keys are ignored,
+            with a warning.
 
         Returns
         -------

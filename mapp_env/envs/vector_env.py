@@ -15,10 +15,16 @@ from numpy.typing import NDArray
 
 from mapp_env.engine.loops import find_bad_action
 from mapp_env.engine.observation import Observation
-from mapp_env.engine.options import check_options, check_problems, check_reset_mask
+from mapp_env.engine.options import (
+    BATCH_OPTIONS,
+    check_options,
+    check_problems,
+    check_reset_mask,
+    warn_of_unknown,
+)
 from mapp_env.engine.rows import Rows
 from mapp_env.engine.seeds import RowSeeds
-from mapp_env.engine.sources import OWN_LIMIT, Source
+from mapp_env.engine.sources import NO_GRIDS, OWN_LIMIT, Source
 from mapp_env.engine.task import Task
 from mapp_env.envs.arguments import BATCH_RENDER_MODES, AutoresetMode, BatchTask, takes
 from mapp_env.envs.central_env import CentralEnv, central_action_space
@@ -42,7 +48,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         Number of rows B, 1 to 1,048,576.
     autoreset_mode : gymnasium.vector.AutoresetMode or str
         When a finished row starts its next episode: ``NEXT_STEP`` (Gymnasium's default),
-        ``SAME_STEP`` or ``DISABLED``, with infos where Gymnasium puts them.
+        ``SAME_STEP`` or ``DISABLED``, as a string in this or Gymnasium's spelling (``"NextStep"``),
+        with infos where Gymnasium puts them.
     central_action : {"multi", "joint", "auto"}
         Actions of shape (B, N), one per agent, or (B,), numbered joint actions.
     grid, n_agents, n_landmarks, max_cycles, reward, observation, allow_wait, render_mode
@@ -102,6 +109,16 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
     def max_cycles(self, value: int) -> None:
         self._rows.max_cycles = check_count("max_cycles", value, 1, MAX_CYCLES)
 
+    def state(self) -> NDArray[np.float32]:
+        """Return each row's global observation (R9), shape (B, N + 2K), whatever agents see.
+
+        It is for central critics. In same-step mode rows that ended have begun their next episode.
+        Raises a ResetNeeded before the first reset.
+        """
+        if not self._started:
+            raise ResetNeeded("state() needs episodes: call reset() first")
+        return self._rows.state.head.astype(np.float32)
+
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The seed of each row; a single environment reset with it is that row."""
@@ -131,7 +148,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             ``"reset_mask"``: bool, shape (B,). ``"landmarks"``, ``"grid"`` or ``"problem"``: as in
             the single environment, for all rows alike; or for each row: an int array of landmarks'
             cells, shape (B, K), or of (row, col) pairs, shape (B, K, 2); the numbers of grids,
-            shape (B,); a sequence of B problems. Other keys are ignored.
+            shape (B,); a sequence of B problems. Other keys are ignored, with a warning.
 
         Returns
         -------
@@ -150,12 +167,13 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if not self._started and not mask.all():
             raise ValueError("options['reset_mask'] must be all True in the first reset")
         asked = check_problems(self._source, self.task, options, self.num_envs)
+        warn_of_unknown(options, BATCH_OPTIONS)
         indices = np.flatnonzero(mask)
         self._seeds.seed(seeds, indices.tolist())
         if asked.problems is not None:
             self._rows.start(indices, asked.problems.take(indices))
         else:
-            self._draw(indices, None if asked.grids is None else asked.grids[indices])
+            self._draw(indices, asked.grids[indices] if len(asked.grids) else NO_GRIDS)
         self._ended[indices] = False
         self._started = True
         views, action_mask = self._rows.observe()
@@ -164,7 +182,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         if self._n_joint_actions:
             add_joint_masks(infos, self._n_joint_actions)
         if self.task.is_pool:
-            infos["grid"], infos["_grid"] = np.where(mask, self._grids(), 0), mask.copy()
+            infos["grid"], infos["_grid"] = np.where(mask, self._rows.grids, 0), mask.copy()
         return views.reshape(self._observations_shape), infos
 
     def step(
@@ -230,7 +248,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
         restarted = mode == AutoresetMode.SAME_STEP
         # With few rows most steps end none, and looking for them takes longest.
         endings = self._no_endings
-        grids = self._grids() if self.task.is_pool else None
+        grids = self._rows.grids if self.task.is_pool else None
         if len(ended):
             last = observations.take(ended, axis=0), masks.take(ended, axis=0)
             endings = (self._rows.measure(ended), *last)
@@ -238,12 +256,8 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
                 self._draw(ended)
                 self._rows.observe_again(ended, views, masks)
         found = observations, rewards, terminations, truncations, masks, self._ended.copy(), ended
-        played = grids, self._grids() if restarted and self.task.is_pool else grids
+        played = grids, self._rows.grids if restarted and self.task.is_pool else grids
         return Transition(*found, *endings, restarted, *played)
-
-    def _grids(self) -> NDArray[np.int64]:
-        """Return the number of each row's grid, shape (B,)."""
-        return self._rows.state.grid[:, 0].astype(np.int64)
 
     def find_problem(self, options: Mapping[str, Any]) -> Problem | None:
         """Return the problem that options of a single environment fix, or ``None``.
@@ -265,7 +279,7 @@ class MappVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.int64], NDArray[An
             tuple(problems.cells[0].tolist()),
         )
 
-    def _draw(self, indices: NDArray[np.int64], grids: NDArray[np.int64] | None = None) -> None:
+    def _draw(self, indices: NDArray[np.int64], grids: NDArray[np.int64] = NO_GRIDS) -> None:
         """Start an episode on a random problem in some rows, (M,), on given grids or any."""
         self._rows.start(indices, self._source.draw(self._seeds.next_words(indices), grids))
 

@@ -1,26 +1,26 @@
-"""Grids by name: bundled ones, and generators of further ones."""
+"""Grids by name: bundled ones, and generators of further ones; and many at once."""
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Mapping, Sequence
-from functools import cache
-from importlib import resources
 from typing import Any
 
 from mapp_env.grid import Grid
-from mapp_env.grids.generators import GENERATORS
+from mapp_env.grids.bundled import bundled_grid, grid_names
+from mapp_env.grids.generators import GENERATORS, option_names
+from mapp_env.grids.pools import load_grids, make_grids
 from mapp_env.validation import check_choice, describe
 
-__all__ = ["find_grid", "find_grids", "generator_names", "grid_names", "make_grid"]
-
-
-@cache
-def grid_names() -> tuple[str, ...]:
-    """Return the names of the bundled grids, sorted."""
-    files = resources.files(__name__).iterdir()
-    return tuple(sorted(file.name[:-4] for file in files if file.name.endswith(".txt")))
+__all__ = [
+    "find_grid",
+    "find_grids",
+    "generator_names",
+    "grid_names",
+    "load_grids",
+    "make_grid",
+    "make_grids",
+]
 
 
 def generator_names() -> tuple[str, ...]:
@@ -45,7 +45,7 @@ def make_grid(name: str = "paper-7x7", **options: Any) -> Grid:
         - ``"maze"``: a maze (:func:`~mapp_env.grids.generators.maze_grid`);
         - ``"warehouse"``: shelves and aisles (:func:`~mapp_env.grids.generators.warehouse_grid`).
     **options
-        Of a generator: ``rows`` and ``cols`` up to 512, ``seed``, and ``density`` of "random",
+        Of a generator: ``rows`` and ``cols`` up to 2048, ``seed``, and ``density`` of "random",
         ``room`` of "rooms", ``loops`` of "maze", ``shelf_length``, ``aisle`` and ``gaps`` of
         "warehouse". Every free cell of a generated grid can be reached from its depot.
 
@@ -56,18 +56,12 @@ def make_grid(name: str = "paper-7x7", **options: Any) -> Grid:
         value is not allowed.
     """
     check_choice("name", name, (*grid_names(), *generator_names()))
-    allowed = inspect.signature(GENERATORS[name]).parameters if name in GENERATORS else {}
+    allowed = ("rows", "cols", "seed", *option_names(name)) if name in GENERATORS else ()
     for option in options:
         if option not in allowed:
-            listed = ", ".join(allowed) if allowed else "no options"
+            listed = ", ".join(allowed) or "no options"
             raise ValueError(f"make_grid({name!r}) takes {listed}; got {option!r}")
-    return GENERATORS[name](**options) if name in GENERATORS else _load(name)
-
-
-@cache
-def _load(name: str) -> Grid:
-    """Read a bundled grid once: grids are frozen, so that all users can share one."""
-    return Grid.from_text(resources.files(__name__).joinpath(f"{name}.txt").read_text("ascii"))
+    return GENERATORS[name](**options) if name in GENERATORS else bundled_grid(name)
 
 
 def find_grid(grid: object) -> Grid:

@@ -6,8 +6,11 @@ grid. All randomness is ``Generator.random``, whose stream NumPy has never chang
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +24,34 @@ MAX_DENSITY = 0.4
 percolation threshold of the square lattice)."""
 
 TRIES = 20  # a strip that falls apart so often is refused within a second
+LEAST_SIDES = {"maze": 3, "random": 2, "rooms": 3, "warehouse": 6}
+
+
+class Option(NamedTuple):
+    """An option of a generator, from ``low`` to ``high``."""
+
+    low: float
+    high: float
+    usual: tuple[float, float]  # the range that grids of a pool are drawn from
+    step: int = 1  # whole numbers; or 0 for real ones
+
+    def check(self, name: str, value: object) -> Any:
+        """Return a value if it is allowed, else raise a ValueError."""
+        if self.step:
+            return check_count(name, value, int(self.low), int(self.high))
+        return check_number(name, value, self.low, self.high)
+
+
+OPTIONS = {
+    "density": Option(0, MAX_DENSITY, (0.0, 0.35), 0),
+    "room": Option(2, MAX_SIDE // 2, (2, 5)),
+    "loops": Option(0, 1, (0.02, 0.5), 0),
+    "shelf_length": Option(2, MAX_SIDE // 2, (2, 8)),
+    "aisle": Option(1, 8, (1, 2)),
+    "gaps": Option(0, 1, (0.0, 0.2), 0),
+}
+"""All options but sides and seed, which every generator takes."""
+
 PARTS = 32  # a part with half of the free cells is rarely far from the centre
 
 
@@ -33,7 +64,7 @@ def random_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, density: float
     Parameters
     ----------
     rows, cols : int
-        2 to 512.
+        2 to 2048.
     seed : int
         Which of them.
     density : float
@@ -44,8 +75,8 @@ def random_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, density: float
     ValueError
         If an argument is invalid.
     """
-    rng = _start(rows, cols, 2, seed)
-    density = check_number("density", density, 0, MAX_DENSITY)
+    rng = _start("random", rows, cols, seed)
+    density = OPTIONS["density"].check("density", density)
     for _ in range(TRIES):
         walls = np.zeros((rows, cols), np.bool_)
         order = np.argsort(rng.random(rows * cols), kind="stable")
@@ -66,11 +97,11 @@ def rooms_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, room: int = 5) 
     Parameters
     ----------
     rows, cols : int
-        3 to 512.
+        3 to 2048.
     seed : int
         Which of them.
     room : int
-        Shortest side of a room, 2 to 256; no room is longer than three times that, except where a
+        Shortest side of a room, 2 to 1024; no room is longer than three times that, except where a
         wall would block a door.
 
     Raises
@@ -78,8 +109,8 @@ def rooms_grid(*, rows: int = 32, cols: int = 32, seed: int = 0, room: int = 5) 
     ValueError
         If an argument is invalid.
     """
-    rng = _start(rows, cols, 3, seed)
-    room = check_count("room", room, 2, MAX_SIDE // 2)
+    rng = _start("rooms", rows, cols, seed)
+    room = OPTIONS["room"].check("room", room)
     walls = np.zeros((rows, cols), np.bool_)
     parts = [(0, 0, rows, cols)]
     while parts:
@@ -129,7 +160,7 @@ def maze_grid(*, rows: int = 33, cols: int = 33, seed: int = 0, loops: float = 0
     Parameters
     ----------
     rows, cols : int
-        3 to 512.
+        3 to 2048.
     seed : int
         Which of them.
     loops : float
@@ -141,8 +172,8 @@ def maze_grid(*, rows: int = 33, cols: int = 33, seed: int = 0, loops: float = 0
     ValueError
         If an argument is invalid.
     """
-    rng = _start(rows, cols, 3, seed)
-    loops = check_number("loops", loops, 0, 1)
+    rng = _start("maze", rows, cols, seed)
+    loops = OPTIONS["loops"].check("loops", loops)
     walls = np.ones((rows, cols), np.bool_)
     rows, cols = (rows + 1) // 2, (cols + 1) // 2
     walls[::2, ::2] = False
@@ -188,11 +219,11 @@ def warehouse_grid(
     Parameters
     ----------
     rows, cols : int
-        6 to 512.
+        6 to 2048.
     seed : int
         Which shelves are missing.
     shelf_length : int
-        Cells along a shelf, 2 to 256; a shelf is shorter where the grid is.
+        Cells along a shelf, 2 to 1024; a shelf is shorter where the grid is.
     aisle : int
         Width of aisles, 1 to 8; less at the edges of a narrow grid.
     gaps : float
@@ -203,10 +234,10 @@ def warehouse_grid(
     ValueError
         If an argument is invalid.
     """
-    rng = _start(rows, cols, 6, seed)
-    length = check_count("shelf_length", shelf_length, 2, MAX_SIDE // 2)
-    aisle = check_count("aisle", aisle, 1, 8)
-    gaps = check_number("gaps", gaps, 0, 1)
+    rng = _start("warehouse", rows, cols, seed)
+    length = OPTIONS["shelf_length"].check("shelf_length", shelf_length)
+    aisle = OPTIONS["aisle"].check("aisle", aisle)
+    gaps = OPTIONS["gaps"].check("gaps", gaps)
     walls = np.zeros((rows, cols), np.bool_)
     for top, bottom in _shelves(rows - 1, 2, aisle):  # one more free row for the depot
         for left, right in _shelves(cols, length, aisle):
@@ -223,10 +254,17 @@ GENERATORS: dict[str, Callable[..., Grid]] = {
 """The generators by the name that ``make_grid`` knows."""
 
 
-def _start(rows: object, cols: object, low: int, seed: object) -> np.random.Generator:
+@cache
+def option_names(kind: str) -> tuple[str, ...]:
+    """Return which options a generator takes besides sides and seed; a bundled grid has none."""
+    taken = inspect.signature(GENERATORS[kind]).parameters if kind in GENERATORS else {}
+    return tuple(name for name in taken if name in OPTIONS)
+
+
+def _start(kind: str, rows: object, cols: object, seed: object) -> np.random.Generator:
     """Check what all generators take and return their source of randomness."""
-    check_count("rows", rows, low, MAX_SIDE)
-    check_count("cols", cols, low, MAX_SIDE)
+    check_count("rows", rows, LEAST_SIDES[kind], MAX_SIDE)
+    check_count("cols", cols, LEAST_SIDES[kind], MAX_SIDE)
     return np.random.default_rng(check_count("seed", seed, 0, MAX_SEED))
 
 

@@ -37,7 +37,8 @@ class Plan:
     Attributes
     ----------
     tours : tuple of tuple of int
-        For each agent its cells, depot first and last, or empty if it claimed nothing (R8).
+        For each agent its cells, from its start, which is the depot unless the problem says
+        otherwise, to the depot; empty if it claimed nothing (R8, R10).
     claims : tuple of tuple of int
         For each agent the landmarks that it was the first on, in order.
     cover_time : int or float
@@ -100,7 +101,8 @@ class Plan:
         allow_wait : bool
             Whether the environment has the action to wait, 4. With it, an agent waits once it had
             the time to walk home after its last claim; one without a claim waits from the start.
-            Without it, a solver's plan has idle agents bump into walls or step to and fro.
+            Without it, a solver's plan has idle agents bump into walls or step to and fro; only one
+            between four unvisited landmarks, alone on its start, waits all the same.
 
         Returns
         -------
@@ -145,9 +147,9 @@ class Plan:
         Raises
         ------
         ValueError
-            That says what is wrong: a tour that does not start and end at the depot, jumps or runs
-            into a wall; a wrong number of agents; tours, claims or a cost that are not what the
-            rules give; a status or bound that contradicts the cost.
+            That says what is wrong: a tour that does not begin at the agent's start or end at the
+            depot, jumps or runs into a wall; a wrong number of agents; tours, claims or a cost that
+            are not what the rules give; a status or bound that contradicts the cost.
         """
         self._verify(self.problem if problem is None else problem)
 
@@ -217,7 +219,7 @@ class Plan:
         """Write the plan and its problem as JSON, whole or not at all.
 
         Tours are lists of cells. If there are more than 100,000 cells in all, each tour is instead
-        a string of its moves from the depot, a digit each, as the actions are.
+        a string of its moves from the agent's start, a digit each, as the actions are.
 
         Parameters
         ----------
@@ -315,7 +317,10 @@ def _read_tours(source: Record, problem: Problem, n_steps: int) -> tuple[tuple[i
     moves = source.strings("tours", problem.n_agents, "0123")
     if max(map(len, moves)) > n_steps + problem.grid.n_cells:
         raise source.error("tours", "must be the actions' moves and a way home")
-    return tuple(tour_of(problem.grid, line) for line in moves)
+    starts = problem.start_cells
+    return tuple(
+        tour_of(problem.grid, start, line) for start, line in zip(starts, moves, strict=True)
+    )
 
 
 def json_costs(costs: Plan | Episode) -> dict[str, int | None]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.rules import measure_row, reset_row, step_row
-from mapp_env.engine.state import Packed, World, new_rows, split_row
+from mapp_env.engine.state import Packed, new_rows, pack, split_row, unpack
 from mapp_env.engine.world import make_world
 from mapp_env.grid import Grid
+from mapp_env.plans.walks import close_tours
 from mapp_env.problem import Problem
 
 
@@ -44,63 +45,74 @@ def _play(problem: Problem, data: bytes) -> Episode:
     actions = np.frombuffer(data, np.int64).reshape(-1, problem.n_agents)[: problem.max_cycles]
     actions = actions.copy()
     n_agents, n_landmarks = problem.n_agents, len(problem.landmarks)
-    world = make_world(problem.grid, n_agents, n_landmarks)
+    grid = problem.grid
+    world = _world(grid, n_agents, n_landmarks)
     row = new_rows(1, n_agents, n_landmarks)[0]
     cells = np.empty((len(actions) + 1, n_agents), np.int32)
     cells[0] = problem.start_cells
-    reset_row(row, np.array(problem.landmarks, np.int32), cells[0], world)
-    visits = np.zeros(n_landmarks, np.int64)
-    steps = play_row(row, actions, cells, visits, tuple(world))
+    visits = np.zeros((n_landmarks, 2), np.int64)
+    costs = np.empty(3)
+    steps = play_row(
+        row, np.array(problem.landmarks, np.int32), actions, cells, visits, costs, world
+    )
     claims: list[list[int]] = [[] for _ in range(n_agents)]
     claim_steps: list[list[int]] = [[] for _ in range(n_agents)]
-    for landmark in np.argsort(visits, kind="stable"):
-        cell, step = problem.landmarks[landmark], int(visits[landmark])
+    order = np.argsort(visits[:, 0], kind="stable")
+    for landmark, (step, agent) in zip(order.tolist(), visits[order].tolist(), strict=True):
         if step > 0:
-            agent = int(np.argmax(cells[step] == cell))
-            claims[agent].append(cell)
+            claims[agent].append(problem.landmarks[landmark])
             claim_steps[agent].append(step)
-    costs = measure_row(row, world)
-    tours = (_tour(problem.grid, cells[:, n], claim_steps[n]) for n in range(n_agents))
+    last = np.array([max(found, default=0) for found in claim_steps])
+    home = max(int(grid.home[found[-1]]) if found else 0 for found in claims)
+    tours, lengths = np.empty((n_agents, steps + 1 + home), np.int32), np.empty_like(last)
+    close_tours(grid.moves, grid.home, cells, last, tours, lengths)
     return Episode(
-        tuple(tours),
+        tuple(tuple(tour[:length]) for tour, length in zip(tours.tolist(), lengths, strict=True)),
         tuple(map(tuple, claims)),
         tuple(map(tuple, claim_steps)),
         tuple(map(tuple, actions[:steps].tolist())),
-        *(int(cost) if cost < math.inf else math.inf for cost in costs),
+        *(int(cost) if cost < math.inf else math.inf for cost in costs.tolist()),
     )
 
 
-def _tour(grid: Grid, cells: NDArray[np.int32], claim_steps: list[int]) -> tuple[int, ...]:
-    """Return an agent's cells without pauses, cut at its last claim and closed (R8)."""
-    if not claim_steps:
-        return ()
-    cells = cells[: claim_steps[-1] + 1]
-    moved = np.append(True, cells[1:] != cells[:-1])
-    return (*cells[moved].tolist(), *grid.path(int(cells[-1]), grid.depot)[1:])
+@lru_cache(maxsize=2)
+def _world(grid: Grid, n_agents: int, n_landmarks: int) -> Packed:
+    return pack(make_world(grid, n_agents, n_landmarks))
 
 
 @kernel
 def play_row(
     row: NDArray[np.int32],
+    landmarks: NDArray[np.int32],
     actions: NDArray[np.int64],
     cells: NDArray[np.int32],
     visits: NDArray[np.int64],
+    costs: NDArray[np.float64],
     world: Packed,
 ) -> int:
-    """Step a row that was reset through joint actions (T, N); return how many were carried out.
+    """Play joint actions (T, N) in a row on landmarks (K,); return how many were carried out.
 
-    Written are where the agents are after each step, ``cells`` (T + 1, N), and the step at which
-    each landmark is visited, ``visits`` (K,), zero on entry.
+    Written are where the agents are after each step, ``cells`` (T + 1, N), of which the first line
+    says where they start; the step at which each landmark is visited and by whom, ``visits``
+    (K, 2), zero on entry; and the costs (R8), (3,).
     """
-    own = World(*world)
+    own = unpack(world)
     state = split_row(row, own.n_agents, own.n_landmarks)
-    for step in range(1, actions.shape[0] + 1):
-        _, terminated, _ = step_row(row, actions[step - 1], actions.shape[0], own)
+    reset_row(row, landmarks, cells[0], own)
+    steps: int = actions.shape[0]
+    for step in range(1, steps + 1):
+        _, terminated, _ = step_row(row, actions[step - 1], steps, own)
         for agent in range(own.n_agents):
             cells[step, agent] = state.cells[agent]
         for landmark in range(own.n_landmarks):
-            if state.visited[landmark] == 1 and visits[landmark] == 0:
-                visits[landmark] = step
+            if state.visited[landmark] == 1 and visits[landmark, 0] == 0:
+                visits[landmark, 0] = step
+                agent = 0
+                while state.cells[agent] != state.landmarks[landmark]:
+                    agent += 1
+                visits[landmark, 1] = agent
         if terminated:
-            return step
-    return len(actions)
+            steps = step
+            break
+    costs[0], costs[1], costs[2] = measure_row(row, own)
+    return steps

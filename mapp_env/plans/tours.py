@@ -2,116 +2,115 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapp_env.engine.state import WAIT
-from mapp_env.grid import Grid
+from mapp_env.grid import FAR, Grid
+from mapp_env.plans.walks import Cells, first_visits, trace_tours, walk_team
 from mapp_env.problem import Problem
 from mapp_env.validation import as_array, as_integer, describe
 
 
-def tour_through(grid: Grid, landmarks: Iterable[int]) -> tuple[int, ...]:
-    """Return the cells of shortest paths depot -> landmarks in order -> depot, or ``()``."""
-    cells = [grid.depot]
-    for landmark in landmarks:
-        cells.extend(grid.path(cells[-1], landmark)[1:])
-    if len(cells) == 1:
-        return ()
-    return (*cells, *grid.path(cells[-1], grid.depot)[1:])
+def walk_routes(problem: Problem, routes: Sequence[Sequence[int]]) -> NDArray[np.int64]:
+    """Return the joint actions, shape (T, N), of a team that walks its routes on shortest paths.
+
+    Routes are landmarks' cells in order, one for each agent: from its start through them to the
+    depot, as :func:`walk_tours` says.
+    """
+    grid, sizes = problem.grid, _lengths(routes)
+    padded = _padded(routes, sizes)
+    starts, lengths = np.array(problem.start_cells, np.int32), np.empty_like(sizes)
+    search = np.empty((2, grid.n_cells), np.int32)
+    longest = 256
+    width = 0
+    while width < longest:
+        width = longest
+        tours = np.empty((len(sizes), width), np.int32)
+        longest = trace_tours(grid.moves, grid.home, starts, padded, sizes, search, tours, lengths)
+    return _walk(problem, tours, lengths)
 
 
 def walk_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> NDArray[np.int64]:
-    """Return the joint actions of a team that walks its tours without a pause.
+    """Return the joint actions, shape (T, N), of a team that walks its tours without a pause.
 
-    They end when every landmark is visited, or all tours are walked. An agent that is home earlier
-    bumps into a wall, if the depot has one beside it; else it steps to and fro, never first on an
-    unvisited landmark: the environment may have no action to wait, and nobody should claim more
-    than its tour. Where every neighbour of the depot is an unvisited landmark, an agent without a
-    tour follows the first step of one before it that has one (without such an agent it waits,
-    action 4), so idle agents should come last.
+    They end when every landmark is visited, or all tours are walked. An agent that is home earlier,
+    or has no tour and stays at its start, bumps into a wall, if the cell has one beside it; else it
+    steps to and fro, never first on an unvisited landmark: the environment may have no action to
+    wait, and nobody should claim more than its tour. Where every neighbour of its cell is an
+    unvisited landmark, it follows the first step of an agent before it that has the same start (so
+    idle agents should come last), and else waits, action 4, until one is visited.
 
-    Tours are cells from depot to depot, neighbours in turn, or nothing; the result has shape
-    (T, N). The problem's step limit is ignored.
+    Tours are cells from an agent's start to the depot, neighbours in turn, or nothing. The
+    problem's step limit is ignored.
     """
-    grid = problem.grid
-    # Who comes by each landmark first, and when; in one step, the agent of the lowest index.
-    claims: dict[int, tuple[float, int]] = dict.fromkeys(problem.landmarks, (math.inf, 0))
-    for agent, tour in enumerate(tours):
-        for step, cell in enumerate(tour):
-            if cell in claims and (step, agent) < claims[cell]:
-                claims[cell] = (step, agent)
-    n_steps = max(step for step, _ in claims.values())
-    if n_steps == math.inf:
-        n_steps = max(0, *(len(tour) - 1 for tour in tours))
-    actions = np.empty((int(n_steps), len(tours)), np.int64)
-    for agent, tour in enumerate(tours):
-        cells = np.array(tour[: len(actions) + 1], np.int64)
-        walked = max(len(cells) - 1, 0)
-        actions[:walked, agent] = _moves(grid, cells)
-        actions[walked:, agent] = _idle_actions(grid, claims, agent, walked, len(actions))
+    lengths = _lengths(tours)
+    return _walk(problem, _padded(tours, lengths), lengths)
+
+
+def _walk(problem: Problem, tours: Cells, lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+    landmarks = np.array(problem.landmarks, np.int32)
+    places = np.full(problem.grid.n_cells, -1, np.int32)
+    places[landmarks] = np.arange(len(landmarks))
+    visits = np.empty((len(landmarks), 2), np.int64)
+    n_steps = first_visits(tours, lengths, places, visits)
+    if n_steps == FAR:
+        n_steps = max(0, int(lengths.max()) - 1)
+    actions = np.empty((n_steps, problem.n_agents), np.int64)
+    starts = np.array(problem.start_cells, np.int32)
+    walk_team(problem.grid.moves, starts, tours, lengths, places, visits, actions)
     return actions
 
 
-def _moves(grid: Grid, cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the moves between cells, neighbours in turn."""
-    ways = grid.moves[cells[:-1]]
-    moves: NDArray[np.int64] = (ways == cells[1:, None]).argmax(axis=1)
-    return moves
+def _lengths(lines: Sequence[Sequence[int]]) -> NDArray[np.int64]:
+    return np.array([len(line) for line in lines])
+
+
+def _padded(lines: Sequence[Sequence[int]], lengths: NDArray[np.int64]) -> Cells:
+    """Return lines of cells as an array as wide as the longest."""
+    padded = np.empty((len(lines), max(1, int(lengths.max()))), np.int32)
+    for row, line in zip(padded, lines, strict=True):
+        row[: len(line)] = line
+    return padded
 
 
 def moves_of(grid: Grid, tour: Sequence[int]) -> str:
     """Return the moves of a tour, a digit each: 0 left, 1 right, 2 up, 3 down."""
-    moves = _moves(grid, np.array(tour, np.int64))
-    return (moves + ord("0")).astype(np.uint8).tobytes().decode("ascii")
+    cells = np.array(tour, np.int64)
+    moves = (grid.moves[cells[:-1]] == cells[1:, None]).argmax(axis=1)
+    letters: bytes = (moves + ord("0")).astype(np.uint8).tobytes()
+    return letters.decode("ascii")
 
 
-def tour_of(grid: Grid, moves: str) -> tuple[int, ...]:
-    """Return the cells from the depot on that moves lead to, walls and borders unheeded."""
+def tour_of(grid: Grid, start: int, moves: str) -> tuple[int, ...]:
+    """Return the cells from a start on that moves lead to, walls and borders unheeded."""
     if not moves:
         return ()
     ways = np.array([-1, 1, -grid.cols, grid.cols])
     digits = np.frombuffer(moves.encode("ascii"), np.uint8) - ord("0")
-    cells = np.cumsum(np.append(grid.depot, ways[digits]))
+    cells = np.cumsum(np.append(start, ways[digits]))
     return tuple(cells.tolist())
 
 
-def _idle_actions(
-    grid: Grid, claims: dict[int, tuple[float, int]], agent: int, start: int, end: int
-) -> list[int]:
-    """Return the actions of an agent on the depot, after step ``start``, that claim nothing."""
-    ways = grid.moves[grid.depot].tolist()
-    if grid.depot in ways:
-        return [ways.index(grid.depot)] * (end - start)
-    for step in range(start, end):
-        for action, to in enumerate(ways):
-            # Agents claim in the order of their index, so who comes later may follow.
-            if claims.get(to, (0, 0)) < (step + 1, agent):
-                back = grid.moves[to].tolist().index(grid.depot)
-                to_and_fro = [action, back] * (end - step)
-                return [WAIT] * (step - start) + to_and_fro[: end - step]
-    return [WAIT] * (end - start)
-
-
 def check_tours(problem: Problem, tours: Sequence[Sequence[int]]) -> None:
-    """Check that each tour is a closed walk from the depot, or empty.
+    """Check that each tour is a walk from the agent's start to the depot, or empty.
 
-    Raises a ValueError if one enters a wall, does not start and end at the depot, jumps or stands
-    still.
+    Raises a ValueError if one enters a wall, does not start and end there, jumps or stands still.
     """
     grid = problem.grid
-    for agent, tour in enumerate(tours):
+    for agent, (tour, start) in enumerate(zip(tours, problem.start_cells, strict=True)):
         if not tour:
             continue
         cells = _as_cells(grid.n_cells, f"plan: tours[{agent}]: cell", tour)
         for cell in cells[grid.walls.ravel()[cells]]:
             raise ValueError(f"plan: tours[{agent}] enters cell {cell}, which is a wall")
-        if tour[0] != grid.depot or tour[-1] != grid.depot:
+        if tour[0] != start or tour[-1] != grid.depot:
+            ends = "start and end at the depot"
+            if start != grid.depot:
+                ends = f"start at cell {start} and end at the depot"
             raise ValueError(
-                f"plan: tours[{agent}] must start and end at the depot, cell {grid.depot}; "
+                f"plan: tours[{agent}] must {ends}, cell {grid.depot}; "
                 f"it goes from {tour[0]} to {tour[-1]}"
             )
         before, after = cells[:-1], cells[1:]

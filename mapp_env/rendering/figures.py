@@ -42,7 +42,8 @@ def draw_plan(
     A colour and a train of arrows for each agent: a full line to its last claim, a dashed one home.
     Routes keep to the right, and those that share a corridor run side by side, so that each can
     be followed both ways. The legend gives the length of every tour. Landmarks are red flags,
-    as before a visit; those that the plan leaves out stand in a hatched frame.
+    as before a visit; those that the plan leaves out stand in a hatched frame. Where agents start
+    elsewhere than on the depot stands a disc of their colours.
 
     Parameters
     ----------
@@ -73,6 +74,8 @@ def draw_plan(
     signs.tint(problem.landmarks)
     draw_routes(ax, grid, plan, points)
     signs.house(grid.depot)
+    for start in sorted(set(problem.start_cells) - {grid.depot}):
+        signs.disc(start, [n for n, cell in enumerate(problem.start_cells) if cell == start])
     for cell in problem.landmarks:
         if cell not in claimed:
             signs.frame(cell)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap
-from matplotlib.patches import Ellipse, Polygon, Rectangle
+from matplotlib.patches import Ellipse, Polygon, Rectangle, Wedge
 from matplotlib.patheffects import Normal, Stroke
 
 from mapp_env.rendering import palette
@@ -64,7 +64,7 @@ def draw_ground(ax: Axes, grid: Grid) -> None:
 
 @dataclass(frozen=True)
 class Signs:
-    """The signs of a figure: the house on the depot and the flags on the landmarks.
+    """The signs of a figure: the house on the depot, the flags on the landmarks, discs on starts.
 
     They stand above the routes, within a light line, as a route that runs into a flag is still
     seen to, but a flag under a bundle of routes is not. On cells that are smaller than a legible
@@ -112,6 +112,16 @@ class Signs:
         self._add(Polygon(cloth, facecolor=to_hex(palette.FLAG), linewidth=0, zorder=5.2), True)
         self._add(Rectangle(pole, 0.06 * size, length, **ink), True)
         self._add(Ellipse((left, foot), 0.28 * size, 0.10 * size, **ink))
+
+    def disc(self, cell: int, agents: Sequence[int]) -> None:
+        """Draw a start: a disc with a sector for each agent that begins there."""
+        size = 0.6 * self._size(LEAST_FLAG)
+        place = self._place(cell, size)
+        self._add(Ellipse(place, size, size, facecolor=to_hex(palette.PAPER), zorder=4.9), True)
+        for turn, agent in enumerate(agents):
+            angles = 360 * turn / len(agents) - 90, 360 * (turn + 1) / len(agents) - 90
+            colour = to_hex(palette.agent_colour(agent))
+            self._add(Wedge(place, size / 2, *angles, facecolor=colour, linewidth=0, zorder=5))
 
     def frame(self, cell: int) -> None:
         """Mark a landmark that is not visited, exactly on its cell."""

@@ -49,14 +49,14 @@ def rgb_array(scene: Scene, max_side: int = MAX_SIDE) -> Frame:
         The moment to show.
     max_side : int
         Pixels that the longer side of the grid may take; cells are made smaller for it, down to one
-        pixel.
+        pixel. On grids with a side of more than 1024 cells several share a pixel, if need be.
 
     Returns
     -------
     ndarray of uint8, shape (height, width, 3)
         A fresh array; height and width are even, as video encoders want.
     """
-    layout = _layout(scene.grid, len(scene.landmarks), scene.max_cycles, max_side)
+    layout = _layout(*scene.grid.walls.shape, len(scene.landmarks), scene.max_cycles, max_side)
     frame = _background(scene.grid, layout).copy()
     _draw_flag_cells(frame, layout, scene)
     _draw_trails(frame, layout, scene)
@@ -76,6 +76,7 @@ class _Layout:
     width: int
     height: int  # without the bar
     cols: int
+    merged: int  # rows, and columns, of cells that share a pixel; 1 unless `cell` is 1
 
     @property
     def detailed(self) -> bool:
@@ -95,12 +96,16 @@ class _Layout:
     def corner(self, cell: int) -> tuple[int, int]:
         """Return the top and the left of a cell."""
         row, col = divmod(cell, self.cols)
-        return self.top + row * self.cell, self.left + col * self.cell
+        return (
+            self.top + row // self.merged * self.cell,
+            self.left + col // self.merged * self.cell,
+        )
 
     def centre(self, cell: int) -> tuple[float, float]:
         """Return the middle of a cell, down and to the right."""
-        top, left = self.corner(cell)
-        return top + self.cell / 2, left + self.cell / 2
+        row, col = divmod(cell, self.cols)
+        scale = self.cell / self.merged
+        return self.top + (row + 0.5) * scale, self.left + (col + 0.5) * scale
 
     def inside(self, cell: int, size: int) -> tuple[float, float]:
         """Return the point nearest to a cell's middle where an icon is not cut off by the frame."""
@@ -110,16 +115,19 @@ class _Layout:
 
 
 @lru_cache(maxsize=64)
-def _layout(grid: Grid, n_landmarks: int, max_cycles: int, max_side: int) -> _Layout:
-    cell = max(min(MAX_CELL, max_side // max(grid.rows, grid.cols)), 1)
+def _layout(rows: int, cols: int, n_landmarks: int, max_cycles: int, max_side: int) -> _Layout:
+    longer = max(rows, cols)
+    cell = max(min(MAX_CELL, max_side // longer), 1)
+    merged = math.ceil(longer / max_side) if longer > MAX_SIDE else 1
     # The widest texts that the bar will ever show in this episode.
     texts = _status_texts(max_cycles, max_cycles, n_landmarks, n_landmarks)
     bar_width = sum(icons.text(part, TEXT, palette.PAPER).shape[1] for part in texts) + 2 * BAR
-    width = max(grid.cols * cell + 2 * MARGIN, bar_width, MIN_AREA[0])
-    height = max(grid.rows * cell + 2 * MARGIN, MIN_AREA[1])
+    across, down = (math.ceil(side / merged) * cell for side in (cols, rows))
+    width = max(across + 2 * MARGIN, bar_width, MIN_AREA[0])
+    height = max(down + 2 * MARGIN, MIN_AREA[1])
     width, height = width + width % 2, height + height % 2
-    left_edge, top = (width - grid.cols * cell) // 2, (height - grid.rows * cell) // 2
-    return _Layout(cell, left_edge, top, width, height, grid.cols)
+    left_edge, top = (width - across) // 2, (height - down) // 2
+    return _Layout(cell, left_edge, top, width, height, cols, merged)
 
 
 @lru_cache(maxsize=8)
@@ -128,10 +136,13 @@ def _background(grid: Grid, layout: _Layout) -> Frame:
     frame = np.empty((layout.height + BAR, layout.width, 3), dtype=np.uint8)
     frame[:] = palette.WALL  # beyond the border agents bump just as into walls
     frame[layout.height :] = palette.INK
-    cell, (rows, cols) = layout.cell, grid.walls.shape
+    cell = layout.cell
     colours = np.where(grid.walls[:, :, None], palette.WALL, palette.FLOOR).astype(np.uint8)
-    area = frame[layout.top :, layout.left :][: rows * cell, : cols * cell]
-    area[:] = colours.repeat(cell, axis=0).repeat(cell, axis=1)
+    if layout.merged > 1:
+        colours = _merge(colours, layout.merged)
+    picture = colours.repeat(cell, axis=0).repeat(cell, axis=1)
+    area = frame[layout.top :, layout.left :][: picture.shape[0], : picture.shape[1]]
+    area[:] = picture
     if layout.detailed:
         free = ~grid.walls
         for row, col in np.argwhere(free[:, 1:] & free[:, :-1]):
@@ -141,6 +152,15 @@ def _background(grid: Grid, layout: _Layout) -> Frame:
         _tint(frame, layout, grid.depot, palette.DEPOT_CELL)
     frame.flags.writeable = False
     return frame
+
+
+def _merge(colours: Frame, merged: int) -> Frame:
+    """Return the mean colours of squares of so many rows and columns, smaller at the far edges."""
+    sums, counts = colours.astype(np.uint32), np.ones(colours.shape[:2], np.uint32)
+    for axis in (0, 1):
+        firsts = np.arange(0, colours.shape[axis], merged)
+        sums, counts = (np.add.reduceat(part, firsts, axis=axis) for part in (sums, counts))
+    return (sums // counts[:, :, None]).astype(np.uint8)
 
 
 def _draw_flag_cells(frame: Frame, layout: _Layout, scene: Scene) -> None:

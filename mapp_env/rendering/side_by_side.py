@@ -163,5 +163,6 @@ def check_plans(problem: object, plans: object) -> None:
             )
         own = plan.problem or problem
         same = own.grid == problem.grid and set(own.landmarks) == set(problem.landmarks)
+        same = same and own.start_cells == problem.start_cells
         if not same or len(plan.tours) != problem.n_agents:
             raise ValueError(f"plans[{describe(label)}] is a plan of another problem")

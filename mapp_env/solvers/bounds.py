@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem
-from mapp_env.solvers.exact import smallest_limit
+from mapp_env.solvers.exact import least_total
+from mapp_env.solvers.families import smallest_limit, smallest_limit_from
 from mapp_env.solvers.held_karp import Steps, route_tables
-from mapp_env.solvers.solution import UNBOUNDED, team_of
+from mapp_env.solvers.solution import UNBOUNDED, Distances, team_of
 from mapp_env.validation import check_choice
 
 SUBSET = 12  # landmarks that subset_bound() looks at: about a millisecond
@@ -19,58 +20,78 @@ SCALE = 1 << 10
 """Penalties are whole multiples of 1 / SCALE of a step, so that a bound has no rounding error."""
 
 
-def lower_bound(problem: Problem, objective: str, distances: Steps) -> int:
+def lower_bound(problem: Problem, objective: str, distances: Distances) -> int:
     """Return a cost that no plan of a problem can beat; up to 12 landmarks it is the optimum.
 
-    ``distances`` are :func:`~mapp_env.solvers.solution.landmark_distances`. Raises a ValueError if
-    the objective is unknown.
+    ``distances`` are the problem's, of agents that start anywhere. Raises a ValueError if the
+    objective is unknown.
     """
     check_choice("objective", objective, OBJECTIVES)
-    teams, closed = team_of(objective, problem.n_agents, len(distances) - 1)
-    return subset_bound(distances, teams, closed, tree_bound(distances, teams, closed))
+    return subset_bound(distances, objective, tree_bound(distances, objective))
 
 
-def tree_bound(distances: Steps, teams: int, closed: bool) -> int:
-    """Return a lower bound of the longest route of a team.
+def tree_bound(distances: Distances, objective: str) -> int:
+    """Return a lower bound of the longest route of a team, or of the sum of its tours.
 
     It is the largest of
 
-    - the farthest landmark, for closed tours there and back;
-    - for closed tours: the tour of one agent is no longer than all tours together (triangle
-      inequality), and no shorter than the best 1-tree under any node penalties; the longest is at
-      least the share of one of N agents;
-    - for open routes: they form a spanning tree in which a landmark has at most two neighbours and
-      the depot at most N, again under node penalties; one agent walks at least an N-th of it.
+    - the landmark that takes longest to visit, for closed tours and go home from;
+    - for closed tours from the depot: the tour of one agent is no longer than all tours together
+      (triangle inequality), and no shorter than the best 1-tree under any node penalties; the
+      longest is at least the share of one of N agents;
+    - for open routes: they form a spanning tree, all starts being one node, in which a landmark has
+      at most two neighbours and the starts together at most N, again under node penalties; one
+      agent walks at least an N-th of it;
+    - for closed tours from elsewhere: that, and the shortest way home from a landmark.
 
-    Closed tours on a grid have even length, so their bounds are rounded up to even numbers.
+    Closed tours on a grid from the depot have even length, as have those from all cells at an even
+    distance from it, so their bounds are rounded up to even numbers.
     """
-    n_nodes = len(distances)
-    farthest = int(distances[0].max()) * (2 if closed else 1)
+    between, starts = distances
+    teams, closed = team_of(objective, len(starts), len(between) - 1)
+    nearest = starts.min(axis=0)
+    back = between[0] if closed else np.zeros_like(nearest)
+    farthest = int((nearest + back)[1:].max())
+    n_nodes = len(between)
     if n_nodes == 2:
         return farthest
-    scaled = ascend(distances, closed, teams, np.zeros((4, n_nodes), np.int64))
-    spread = -(-int(scaled) // (SCALE * teams))
-    if closed:
+    room = np.zeros((4, n_nodes), np.int64)
+    if starts[:, 0].any():
+        between = between.copy()
+        between[0] = between[:, 0] = nearest
+        sum_of_all = int(ascend(between, False, min(len(starts), n_nodes - 1), room))
+        sum_of_all += SCALE * int(back[1:].min())
+    else:
+        sum_of_all = int(ascend(between, closed, teams, room))
+    spread = -(-sum_of_all // (SCALE * teams))
+    if closed and not (starts[:, 0] % 2).any():
         spread += spread % 2
     return max(farthest, spread)
 
 
-def subset_bound(distances: Steps, teams: int, closed: bool, low: int) -> int:
+def subset_bound(distances: Distances, objective: str, low: int) -> int:
     """Return the optimum of 12 landmarks, or ``low`` if that is larger.
 
     Leaving landmarks out keeps a plan valid, so another landmark never lowers the optimum. The
-    farthest from the depot comes first, then always the one for which the distance to the nearest
-    chosen landmark and the distance to the depot have the largest sum.
+    farthest from all starts comes first, then always the one for which the distance to the nearest
+    chosen landmark and the distance to the nearest start have the largest sum.
     """
-    home = distances[0]
-    nodes = [0, int(home.argmax())]
-    nearest = distances[nodes[-1]].copy()
-    for _ in range(1, min(SUBSET, len(distances) - 1)):
-        # Chosen ones are 0 from themselves, but may be far from the depot.
-        nodes.append(int(np.where(nearest > 0, nearest + home, 0)[1:].argmax()) + 1)
-        np.minimum(nearest, distances[nodes[-1]], out=nearest)
-    _, costs = route_tables(np.ascontiguousarray(distances[np.ix_(nodes, nodes)]), closed)
-    return smallest_limit(costs, min(teams, len(nodes) - 1), low)
+    between, starts = distances
+    reach = starts.min(axis=0)
+    nodes = [0, int(reach[1:].argmax()) + 1]
+    nearest = between[nodes[-1]].copy()
+    for _ in range(1, min(SUBSET, len(between) - 1)):
+        # Chosen ones are 0 from themselves, but may be far from the starts.
+        nodes.append(int(np.where(nearest > 0, nearest + reach, 0)[1:].argmax()) + 1)
+        np.minimum(nearest, between[nodes[-1]], out=nearest)
+    ways = np.ascontiguousarray(between[np.ix_(nodes, nodes)])
+    teams, closed = team_of(objective, len(starts), len(nodes) - 1)
+    if not starts[:, 0].any():
+        return smallest_limit(route_tables(ways, closed)[1], teams, low)
+    part = Distances(ways, np.ascontiguousarray(starts[:, nodes]))
+    if objective == "total_distance":
+        return max(low, least_total(part)[0])
+    return smallest_limit_from(part, closed, low)
 
 
 # -- spanning trees ------------------------------------------------------

@@ -24,8 +24,22 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.grid import FAR
 from mapp_env.problem import Problem
-from mapp_env.solvers.held_karp import Steps, route_tables, tours_within, trace_route
-from mapp_env.solvers.solution import Solution, landmark_distances, solution_of, team_of
+from mapp_env.solvers.families import (
+    Families,
+    smallest_limit,
+    smallest_limit_from,
+    split_among,
+    tours_from,
+)
+from mapp_env.solvers.held_karp import (
+    Steps,
+    join_agent,
+    route_tables,
+    shortest_routes,
+    tours_within,
+    trace_route,
+)
+from mapp_env.solvers.solution import Distances, Solution, problem_distances, solution_of, team_of
 
 MAX_EXACT_LANDMARKS = 20  # the table of routes takes 80 MiB then
 FEW_AGENTS = 5  # up to here, a table per agent of the sets it needs is faster than one of all sets
@@ -48,104 +62,110 @@ def solve_exact(
         )
     order = np.argsort(problem.landmarks)
     nodes = np.concatenate(([0], order + 1))
-    distances = np.ascontiguousarray(landmark_distances(problem)[np.ix_(nodes, nodes)])
-    teams, closed = team_of(objective, problem.n_agents, n_landmarks)
-    routes, costs = route_tables(distances, closed)
-    optimum = smallest_limit(costs, teams)
-    tours = np.empty(1 << n_landmarks, np.int32)
-    tours_within(distances, routes, closed, optimum, tours)
-    found = []
-    for part in _split(tours, Families(costs <= optimum), teams):
-        route = np.empty(n_landmarks, np.int32)
-        count = trace_route(distances, routes, closed, optimum, part, route)
-        found.append((order[route[:count]] + 1).tolist())
+    between, starts = problem_distances(problem)
+    distances = Distances(between[np.ix_(nodes, nodes)].copy(), starts[:, nodes].copy())
+    if distances.starts[:, 0].any():
+        if objective == "total_distance":
+            optimum, routes = least_total(distances)
+        else:
+            optimum, routes = _least_longest(distances, objective == "makespan")
+    else:
+        teams, closed = team_of(objective, problem.n_agents, n_landmarks)
+        optimum, routes = _solve_alike(distances.between, teams, closed)
+    found = [(order[route] + 1).tolist() for route in routes]
     return solution_of(problem, found, optimum, optimum)
 
 
-# -- how many agents are enough ------------------------------------------
+Answer = tuple[int, list[NDArray[np.int32]]]
+"""The optimum, and the landmarks of each agent's route, in the order of the tables."""
 
 
-def smallest_limit(costs: Steps, teams: int, low: int = 0) -> int:
-    """Return the least limit, from ``low`` on, within which so many agents visit everything.
-
-    ``costs``, shape (2 ** K,), is what each set costs one agent; ``low`` a known lower bound.
-    """
-    high = int(costs[-1])
-    # An agent alone could walk the others' routes there and back, and its own last.
-    alone = -(-high // (2 * teams - 1))
-    farthest = costs[1 << np.arange(len(costs).bit_length() - 1)].max()
-    low = max(low, alone, int(farthest))
-    while low < high:
-        middle = (low + high) // 2
-        if Families(costs <= middle).cover(teams):
-            high = middle
-        else:
-            low = middle + 1
-    return low
+def _solve_alike(distances: Steps, teams: int, closed: bool) -> Answer:
+    """Solve for agents that all start on the depot; only the first ones have routes."""
+    routes, costs = route_tables(distances, closed)
+    optimum = smallest_limit(costs, teams)
+    tours = np.empty(len(costs), np.int32)
+    tours_within(distances, routes, closed, optimum, tours)
+    parts = _split(tours, Families(costs <= optimum), teams)
+    return optimum, [_trace(distances, routes, closed, optimum, part) for part in parts]
 
 
-class Families:
-    """The sets of landmarks that 1, 2, 3, ... agents can visit within a limit.
-
-    Whether N sets, one per agent, cover all landmarks is decided by counting: the pairs
-    of sets whose union is a given set, for all sets at once, by zeta and Moebius transforms over
-    the subset lattice (inclusion-exclusion, as in Bjorklund, Husfeldt and Koivisto 2009,
-    doi:10.1137/070683933). Counts stay below 4**20, so whole 64-bit numbers are exact.
-
-    ``one``, shape (2 ** K,), are the sets that one agent can visit; with a set, all its subsets.
-    """
-
-    def __init__(self, one: NDArray[np.bool_]) -> None:
-        self._families = {1: one}
-
-    def __getitem__(self, teams: int) -> NDArray[np.bool_]:
-        """Return the family of so many agents, (2 ** K,) bool."""
-        if teams not in self._families:
-            half = teams // 2
-            self._families[teams] = _unions(self[half], self[teams - half])
-        return self._families[teams]
-
-    def cover(self, teams: int) -> bool:
-        """Return whether so many agents can visit everything."""
-        if teams == 1:
-            return bool(self[1][-1])
-        # What the first half of them visits, the second may leave out: families hold all subsets.
-        first, second = self[teams // 2], self[teams - teams // 2]
-        return bool((first & second[::-1]).any())
+def _trace(
+    distances: Steps, routes: Steps, closed: bool, limit: int, part: int
+) -> NDArray[np.int32]:
+    route = np.empty(routes.shape[1], np.int32)
+    return route[: trace_route(distances, routes, closed, limit, part, route)]
 
 
-def _unions(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the family of all unions of a set of one family and a set of another."""
-    if first[-1] or second[-1]:
-        return np.ones_like(first)
-    # Of each set, how many pairs of its subsets there are; then, of how many it is the union.
-    counts = first.astype(np.int64)
-    sum_subsets(counts, 1)
-    if first is second:
-        counts *= counts
-    else:
-        others = second.astype(np.int64)
-        sum_subsets(others, 1)
-        counts *= others
-    sum_subsets(counts, -1)
-    return counts > 0
+# -- from several starts -------------------------------------------------
 
 
-@kernel
-def sum_subsets(counts: NDArray[np.int64], sign: int) -> None:
-    """Replace each set's number by the sum over its subsets, (2 ** K,): the zeta transform.
+def _least_longest(distances: Distances, closed: bool) -> Answer:
+    """Solve for the smallest longest route of agents that start anywhere."""
+    between, starts = distances
+    optimum = smallest_limit_from(distances, closed)
+    routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
+    tables: dict[bytes, Steps] = {}
+    for start in starts:
+        if start.tobytes() not in tables:
+            table = tables[start.tobytes()] = np.empty(len(routes), np.int32)
+            tours_from(between, start, closed, optimum, routes, table)
+    parts = split_among(distances, closed, optimum, [tables[start.tobytes()] for start in starts])
+    found: list[NDArray[np.int32]] = []
+    for start, part in zip(starts, parts, strict=True):
+        members = np.flatnonzero(part >> np.arange(len(between) - 1) & 1)
+        nodes = np.concatenate(([0], members + 1))
+        ways = np.ascontiguousarray(between[np.ix_(nodes, nodes)])
+        leaving = ways.copy()
+        leaving[0] = start[nodes]
+        own = np.empty((1 << len(members), len(members)), np.int32)
+        shortest_routes(leaving, own)
+        route = _trace(ways, own, closed, optimum, len(own) - 1)
+        found.append(members[route].astype(np.int32))
+    return optimum, found
 
-    With the sign -1 undo that: the Moebius transform.
-    """
-    step = 1
-    while step < counts.shape[0]:
-        for base in range(0, counts.shape[0], 2 * step):
-            for index in range(base, base + step):
-                counts[index + step] += sign * counts[index]
-        step *= 2
+
+def least_total(distances: Distances) -> Answer:
+    """Solve for the least sum of closed tours of agents that start anywhere."""
+    between, starts = distances
+    order = np.lexsort(starts.T)
+    routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
+    sums = np.full(len(routes), FAR, np.int32)
+    sums[0] = 0
+    tables = [sums]
+    alike = np.append(False, (starts[order[1:]] == starts[order[:-1]]).all(axis=1))
+    for agent, again in zip(order, alike, strict=True):
+        if again and tables[-1] is tables[-2]:
+            tables.append(tables[-1])  # one more like the last, who was of no use
+            continue
+        more = np.empty_like(sums)
+        join_agent(between, starts[agent], tables[-1], routes, more)
+        tables.append(tables[-1] if np.array_equal(more, tables[-1]) else more)
+    found = [np.empty(0, np.int32)] * len(starts)
+    left = len(sums) - 1
+    for agent, more, fewer in reversed(list(zip(order, tables[1:], tables[:-1], strict=True))):
+        if more[left] < fewer[left]:
+            join_agent(between, starts[agent], fewer, routes, np.empty_like(sums))
+            found[agent], left = _trace_joined(between, starts[agent], fewer, routes, left)
+    return int(tables[-1][-1]), found
 
 
-# -- who visits what -----------------------------------------------------
+def _trace_joined(
+    between: Steps, start: Steps, sums: Steps, routes: Steps, left: int
+) -> tuple[NDArray[np.int32], int]:
+    """Return the route of the agent that was joined last, and what is left to those before."""
+    last = int((routes[left] + between[0, 1:]).argmin())
+    route = [last]
+    while True:
+        steps = routes[left, last]
+        left ^= 1 << last
+        if sums[left] + start[last + 1] == steps:
+            return np.array(route[::-1], np.int32), left
+        last = int((routes[left] + between[last + 1, 1:] == steps).argmax())
+        route.append(last)
+
+
+# -- who visits what, from the depot -------------------------------------
 
 
 def _split(tours: Steps, families: Families, teams: int) -> list[int]:

@@ -118,3 +118,62 @@ def trace_route(
                 end = before
                 break
     return count
+
+
+# -- from several starts -------------------------------------------------
+
+
+def agent_costs(between: Steps, starts: Steps, closed: bool) -> list[Steps]:
+    """Return for each agent what each set of landmarks costs it, N tables of (2 ** K,) steps.
+
+    ``between``, (K + 1, K + 1), and ``starts``, (N, K + 1), are
+    :class:`~mapp_env.solvers.solution.Distances`. Agents whose ways are equally long share a table.
+    """
+    routes = routes_onward(between, closed)
+    tables: dict[bytes, Steps] = {}
+    for start in starts:
+        if start.tobytes() not in tables:
+            costs = tables[start.tobytes()] = np.empty(len(routes), np.int32)
+            route_costs(start[None], routes, True, costs)
+    return [tables[start.tobytes()] for start in starts]
+
+
+def routes_onward(between: Steps, closed: bool) -> Steps:
+    """Return the steps from each landmark through all of a set that holds it, (2 ** K, K).
+
+    A closed tour goes on to the depot. Ways are equally long in both directions, so these are
+    routes that come from the depot, or from nowhere, and end on that landmark.
+    """
+    ways = between.copy()
+    if not closed:
+        ways[0] = ways[:, 0] = 0
+    routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
+    shortest_routes(ways, routes)
+    return routes
+
+
+@kernel
+def join_agent(between: Steps, start: Steps, sums: Steps, routes: Steps, more: Steps) -> None:
+    """Fill in ``more``, the least sums of closed tours through each set with one agent more.
+
+    ``sums`` are those so far, (2 ** K,); ``start``, (K + 1,), the steps from where it starts.
+    ``routes[S, k]``, (2 ** K, K), is the least for all of S where the agent's own route, through
+    any part of S, ends on k: one table for all agents before it spares one of all pairs of sets.
+    """
+    n_landmarks = routes.shape[1]
+    routes[0] = FAR
+    more[0] = 0
+    for members in range(1, routes.shape[0]):
+        fewest = sums[members]
+        for last in range(n_landmarks):
+            bit = 1 << last
+            least = np.int32(FAR)
+            if members & bit != 0:
+                least = min(least, np.int32(sums[members ^ bit] + start[last + 1]))
+                shorter = routes[members ^ bit]
+                steps = between[last + 1]
+                for before in range(n_landmarks):
+                    least = min(least, np.int32(shorter[before] + steps[before + 1]))
+                fewest = min(fewest, np.int32(least + between[0, last + 1]))
+            routes[members, last] = least
+        more[members] = fewest

@@ -4,7 +4,8 @@ PyVRP (Wouda, Lan and Kool 2024, doi:10.1287/ijoc.2023.0055) minimises the sum o
 
 - the longest route is made short by asking for any routes of at most so many steps, one step less
   each time, until it finds none;
-- open routes are closed ones whose arcs back to the depot cost nothing.
+- open routes are closed ones whose arcs back to the depot cost nothing;
+- agents that start elsewhere are vehicles of another depot; those of one start, of one type.
 
 It comes with the extra ``pyvrp`` and is imported when a problem is solved.
 """
@@ -16,11 +17,19 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapp_env.compiled import clock
 from mapp_env.problem import Problem
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.solution import UNBOUNDED, Routes, Solution, landmark_distances, solution_of
+from mapp_env.solvers.solution import (
+    UNBOUNDED,
+    Distances,
+    Routes,
+    Solution,
+    problem_distances,
+    solution_of,
+)
 
 DEFAULT_SECONDS = 2.0  # if there is no time limit
 
@@ -47,10 +56,12 @@ def solve_pyvrp(
     """
     pyvrp = import_pyvrp()
     deadline = clock() + (DEFAULT_SECONDS if time_limit is None else time_limit)
-    distances = landmark_distances(problem)
+    distances = problem_distances(problem)
     bound = lower_bound(problem, objective, distances)
     total = objective == "total_distance"
-    arcs = distances.astype(np.int64)
+    groups, arcs = _group(problem, distances)
+    # From the depot no team walks less than one agent, by the triangle inequality.
+    alone = total and len(arcs) == len(distances.between)
     if objective == "cover_time":
         arcs[:, 0] = 0
     word = int(np.random.SeedSequence(seed).generate_state(1)[0])
@@ -59,16 +70,17 @@ def solve_pyvrp(
     best = UNBOUNDED
     routes: Routes = ()
     while True:
-        # Closed tours on a grid have even length.
-        step = 1 if objective == "cover_time" else 2
+        # Closed tours on a grid have even length, if they begin on the depot.
+        step = 2 if objective == "makespan" and len(arcs) == len(distances.between) else 1
         limit = {"max_distance": best - step} if routes else {}
-        # No team walks less than one agent, by the triangle inequality.
-        vehicles = pyvrp.VehicleType(1 if total else problem.n_agents, **limit)
         data = pyvrp.ProblemData(
             locations=[pyvrp.Location(0, 0) for _ in arcs],
-            clients=[pyvrp.Client(node) for node in range(1, len(arcs))],
-            depots=[pyvrp.Depot(0)],
-            vehicle_types=[vehicles],
+            clients=[pyvrp.Client(node) for node in range(1, len(distances.between))],
+            depots=[pyvrp.Depot(0), *map(pyvrp.Depot, range(len(distances.between), len(arcs)))],
+            vehicle_types=[
+                pyvrp.VehicleType(1 if alone else len(agents), start_depot=depot, **limit)
+                for depot, agents in groups.items()
+            ],
             distance_matrices=[arcs],
             duration_matrices=[np.zeros_like(arcs)],
         )
@@ -84,10 +96,13 @@ def solve_pyvrp(
             break
         lengths = [route.distance() for route in found.routes()]
         best = int(sum(lengths) if total else max(lengths))
-        routes = tuple(
-            tuple(visit.idx + 1 for visit in route.schedule() if visit.is_client())
-            for route in found.routes()
-        )
+        left = [list(agents) for agents in groups.values()]
+        by_agent: list[tuple[int, ...]] = [()] * problem.n_agents
+        for route in found.routes():
+            agent = left[route.vehicle_type()].pop(0)
+            visits = (visit.idx for visit in route.schedule() if visit.is_client())
+            by_agent[agent] = tuple(client + 1 for client in visits)
+        routes = tuple(by_agent)
         if on_better is not None and not total:
             on_better(best)
         if total or best <= bound or clock() >= deadline:
@@ -95,6 +110,29 @@ def solve_pyvrp(
     if not routes:
         raise RuntimeError("PyVRP found no plan, though nothing limits one")
     return solution_of(problem, routes, best, bound)
+
+
+def _group(
+    problem: Problem, distances: Distances
+) -> tuple[dict[int, list[int]], NDArray[np.int64]]:
+    """Return the agents of each depot, and the steps between depot, landmarks and other depots.
+
+    Depot 0 is there in any case, with or without agents; the others are starts.
+    """
+    starts = dict.fromkeys(problem.start_cells)
+    starts.pop(problem.grid.depot, None)
+    places = {cell: place for place, cell in enumerate([problem.grid.depot, *starts])}
+    groups: dict[int, list[int]] = {}
+    for agent, cell in enumerate(problem.start_cells):
+        groups.setdefault(places[cell], []).append(agent)
+    n_nodes = len(distances.between)
+    arcs = np.zeros((n_nodes + len(starts), n_nodes + len(starts)), np.int64)
+    arcs[:n_nodes, :n_nodes] = distances.between
+    for place, agents in groups.items():
+        if place > 0:
+            node = n_nodes + place - 1
+            arcs[node, :n_nodes] = arcs[:n_nodes, node] = distances.starts[agents[0]]
+    return groups, arcs
 
 
 def _stop_at(

@@ -7,6 +7,7 @@ least. Differences from that paper:
 
 - cost is ``weight * longest route + sum of routes``; with plain greedy insertion under it, routes
   level out;
+- each agent begins at a start of its own, and empty routes are alike only if their starts are;
 - the ruin starts from a landmark of the longest route three times out of four;
 - the temperature falls in cycles, each twice as long as the one before, so that neither a time nor
   a number of iterations has to be known in advance, and more of them never make it worse.
@@ -39,11 +40,18 @@ NOW, FALL, WARMEST, COLDEST = range(4)
 
 
 class Layout(NamedTuple):
-    """What is searched: distances between nodes, the depot being node 0, a landmark 1 to K."""
+    """What is searched: nodes and the steps between them.
 
-    distances: NDArray[np.int32]  # (K + 1, K + 1)
-    back: NDArray[np.int32]  # (K + 1,), what going home from a node counts: nothing on open routes
-    near: NDArray[np.int32]  # (K + 1, K), landmarks by distance from each node
+    Node 0 is the depot, 1 to K are landmarks, K + 1 + n is where agent n starts.
+    """
+
+    distances: NDArray[np.int32]  # (K + 1, K + 1 + N), from depot and landmarks to all nodes
+    back: NDArray[np.int32]  # (K + 1 + N,), what going home from a landmark counts, else 0
+    reach: NDArray[np.int32]  # (K + 1,), steps to a landmark from the nearest start
+    near: NDArray[
+        np.int32
+    ]  # (K + 1, K), landmarks by distance; lines that begin with 0 are to come
+    alike: NDArray[np.int64]  # (N,), the first agent with the same way to every landmark
     weight: int  # of the longest route
 
 
@@ -132,11 +140,14 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
         middle = int(team.routes[longest, draw(memory, team.sizes[longest])])
     else:
         middle = 1 + draw(memory, n_landmarks)
+    near = layout.near[middle]
+    if near[0] == 0:
+        sort_near(layout.distances[middle], near)
     count = 0
     for rank in range(n_landmarks):
         if count >= wanted:
             break
-        node = layout.near[middle, rank]
+        node = near[rank]
         agent = scratch.holder[node]
         if agent < 0:
             continue
@@ -158,9 +169,9 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
             route[index - string] = route[index]
         team.sizes[agent] = size - string
         length = 0
-        last = 0
+        last = n_landmarks + 1 + agent
         for index in range(size - string):
-            length += layout.distances[last, route[index]]
+            length += layout.distances[route[index], last]
             last = route[index]
         team.lengths[agent] = length + layout.back[last]
         scratch.touched[agent] = True
@@ -168,9 +179,32 @@ def ruin(layout: Layout, team: Team, scratch: Scratch, memory: NDArray[np.int64]
 
 
 @kernel
+def sort_near(distances: NDArray[np.int32], near: NDArray[np.int32]) -> None:
+    """Write the landmarks, shape (K,), by their ``distances``, shape (K + 1 + N,); ties by number.
+
+    Shell's sort: a line is sorted when it is asked for, and nothing is allocated here.
+    """
+    n_landmarks = near.shape[0]
+    for index in range(n_landmarks):
+        near[index] = index + 1
+    for gap in (57, 23, 10, 4, 1):
+        for index in range(gap, n_landmarks):
+            node = near[index]
+            place = index
+            while place >= gap:
+                other = near[place - gap]
+                apart = distances[other] - distances[node]
+                if apart < 0 or (apart == 0 and other < node):
+                    break
+                near[place] = other
+                place -= gap
+            near[place] = node
+
+
+@kernel
 def sort_removed(count: int, layout: Layout, scratch: Scratch, memory: NDArray[np.int64]) -> None:
     """Put what was removed in the order in which it will be inserted."""
-    # By chance, far from the depot first (twice as rarely), near first, or as removed (rarer yet).
+    # By chance, far from all starts first (twice as rarely), near first, or as removed (rarer yet).
     mode = draw(memory, 8)
     if mode == 7:
         return
@@ -180,7 +214,7 @@ def sort_removed(count: int, layout: Layout, scratch: Scratch, memory: NDArray[n
         if mode < 4:
             keys[index] = draw(memory, 1 << 30)
         else:
-            keys[index] = layout.distances[0, removed[index]] * (-1 if mode < 6 else 1)
+            keys[index] = layout.reach[removed[index]] * (-1 if mode < 6 else 1)
     for index in range(1, count):
         node = removed[index]
         key = keys[index]
@@ -199,28 +233,30 @@ def recreate(
 ) -> None:
     """Insert what was removed, each where it costs least, a few places being overlooked."""
     n_routes = team.sizes.shape[0]
-    distances = layout.distances
+    first_start = layout.near.shape[1] + 1
     top = team.lengths[team.lengths.argmax()]
     blink = 1 + draw(memory, 2 * MEAN_BLINK)
     for index in range(count):
         node = scratch.removed[index]
+        distances = layout.distances[node]
         least = UNBOUNDED
         chosen = 0
         chosen_place = 0
         chosen_detour = 0
-        tried_empty = False
+        empty = 0  # bits of the starts from which an empty route was tried
         for agent in range(n_routes):
             size = team.sizes[agent]
             if size == 0:
-                if tried_empty:
-                    continue  # all empty routes are alike
-                tried_empty = True
-            before = 0
+                bit = 1 << layout.alike[agent]
+                if empty & bit:
+                    continue  # empty routes from one start are alike
+                empty |= bit
+            before = first_start + agent
             for place in range(size + 1):
-                detour = distances[node, before]
+                detour = distances[before]
                 if place < size:
                     after = team.routes[agent, place]
-                    detour += distances[node, after] - distances[before, after]
+                    detour += distances[after] - layout.distances[after, before]
                     before = after
                 else:
                     detour += layout.back[node] - layout.back[before]

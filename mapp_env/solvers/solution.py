@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mapp_env.compiled import kernel
 from mapp_env.grid import Grid, fill_distances
 from mapp_env.problem import Problem
 
@@ -77,15 +78,48 @@ class Distances(NamedTuple):
 
 
 def problem_distances(problem: Problem) -> Distances:
-    """Return the distances of a problem, its agents starting anywhere."""
-    between = landmark_distances(problem)
-    field = {}
-    for cell in set(problem.start_cells) - {problem.grid.depot}:
-        steps = problem.grid.distances_from([cell])[0]
-        field[cell] = steps[[problem.grid.depot, *problem.landmarks]]
-    return Distances(
-        between, np.array([field.get(cell, between[0]) for cell in problem.start_cells], np.int32)
+    """Return the distances of a problem, its agents starting anywhere.
+
+    One breadth-first search a landmark.
+    """
+    grid = problem.grid
+    landmarks = np.array(problem.landmarks, np.int32)
+    cells = np.array(problem.start_cells, np.int32)
+    n_nodes = len(landmarks) + 1
+    found = Distances(
+        np.empty((n_nodes, n_nodes), np.int32), np.empty((len(cells), n_nodes), np.int32)
     )
+    search = np.empty((2, grid.n_cells), np.int32)
+    fill_problem(grid.moves, grid.home, landmarks, cells, search, found.between, found.starts)
+    return found
+
+
+@kernel
+def fill_problem(
+    moves: NDArray[np.int32],
+    home: NDArray[np.int32],
+    landmarks: NDArray[np.int32],
+    cells: NDArray[np.int32],
+    search: NDArray[np.int32],
+    between: NDArray[np.int32],
+    starts: NDArray[np.int32],
+) -> None:
+    """Fill in :class:`Distances` of landmarks, (K,), and the agents' first cells, (N,).
+
+    ``moves`` and ``home`` are the grid's, ``search``, shape (2, C), is scratch space.
+    """
+    between[0, 0] = 0
+    for landmark in range(landmarks.shape[0]):
+        node = landmark + 1
+        steps = search[0]
+        fill_distances(moves, landmarks[landmark], steps, search[1])
+        between[0, node] = between[node, 0] = home[landmarks[landmark]]
+        for other in range(landmarks.shape[0]):
+            between[node, other + 1] = steps[landmarks[other]]
+        for agent in range(cells.shape[0]):
+            starts[agent, node] = steps[cells[agent]]
+    for agent in range(cells.shape[0]):
+        starts[agent, 0] = home[cells[agent]]
 
 
 def landmark_distances(problem: Problem) -> NDArray[np.int32]:

@@ -28,8 +28,14 @@ def save_vrplib(problem: Problem, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     ValueError
-        If the file cannot be written.
+        If the file cannot be written, or agents start elsewhere than on the depot: in this format
+        all vehicles start and end in one place.
     """
+    if set(problem.start_cells) != {problem.grid.depot}:
+        raise ValueError(
+            "problem must have all agents start on the depot, as a VRPLIB file has a single one; "
+            f"got starts {problem.start_cells}"
+        )
     distances = landmark_distances(problem)
     nodes = range(1, len(distances) + 1)
     lines = [

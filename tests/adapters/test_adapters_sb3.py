@@ -602,3 +602,15 @@ def test_two_rows_of_two_landmarks() -> None:
     envs = make_sb3_vec(2, n_landmarks=2)
     envs.set_options([{"landmarks": [0, 6]}, {"landmarks": [42, 20]}])
     assert envs.reset()[:, 3:5].tolist() == [[0, 6], [42, 20]]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_unknown_options_are_named(form: str, same: Callable[[Any, Any], None]) -> None:
+    """A reset warns of an option that is a typo, and draws problems as if it had not been given."""
+    envs, twin = FORMS[form](), FORMS[form]()
+    for each in (envs, twin):
+        each.seed(4)
+    envs.set_options({"landmark": [0, 6]})
+    with pytest.warns(UserWarning, match=r"'landmark' \(did you mean 'landmarks'\?\)"):
+        observations = envs.reset()
+    same(observations, twin.reset())

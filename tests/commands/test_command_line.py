@@ -256,7 +256,7 @@ def test_seed_draws_the_landmarks_not_the_grid(folder: Path) -> None:
         (["--out", "dir.gif"], "not a regular file"),
         (["--grid", "nope"], "--grid must be one of paper-7x7, .*rooms.*no file 'nope'"),
         (["--grid", "bad.txt"], "bad.txt"),
-        (["--grid", "rooms", "--rows", "9999"], r"--rows must be an integer in 3\.\.512"),
+        (["--grid", "rooms", "--rows", "9999"], r"--rows must be an integer in 3\.\.2048"),
         (["--rows", "9"], "--rows, --cols and --grid-seed are for generated grids"),
         (["--n-agents", "0"], r"--n-agents must be an integer in 1\.\.16"),
         (["--n-landmarks", "65"], "--n-landmarks must be at most"),

@@ -70,6 +70,41 @@ def test_solve_prints_the_optimum(capsys: pytest.CaptureFixture[str], objective:
     assert re.fullmatch(r"by exact in \d+\.\d ms", lines[5])
 
 
+def test_solve_from_any_starts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Starts are cells or rows and columns, are printed, and set the number of agents."""
+    problem = mapp_env.Problem(mapp_env.make_grid(), (0, 48), 3, starts=(3, 47, 24))
+    plan = mapp_env.solve(problem)
+    line = ["solve", "--landmarks", "0", "48", "--starts", "0,3", "47", "24"]
+    lines = printed(capsys, *line).splitlines()
+    assert lines[1:3] == ["landmarks: 0 48", "starts: 3 47 24"]
+    assert lines[3] == f"agent 0: {' '.join(map(str, plan.tours[0]))}"
+    assert lines[4] == f"agent 1: {' '.join(map(str, plan.tours[1]))}"
+    assert lines[5] == "agent 2: stays at the depot"
+    found = record(capsys, *line, "--out", "plan.json", "--picture", "a.png")
+    assert found["problem"]["starts"] == [3, 47, 24]
+    assert mapp_env.Plan.load("plan.json") == plan
+    drawn = record(capsys, "render", "--out", "a.gif", "--plan", "plan.json")
+    assert drawn["starts"] == [3, 47, 24]
+    lines = printed(capsys, "solve", "--landmarks", "0", "--starts", "1", "48").splitlines()
+    assert lines[4] == "agent 1: stays at its start"
+    assert {path.name for path in folder.iterdir()} == {"plan.json", "a.png", "a.gif"}
+
+
+def test_drawn_landmarks_are_no_starts(capsys: pytest.CaptureFixture[str]) -> None:
+    """Landmarks drawn beside starts are none of them, are seeded, and fill all room there is."""
+    line = ["solve", "--starts", "0", "1,4", "24", "--n-landmarks", "12", "--time-limit", "0.01"]
+    drawn = []
+    for seed in range(20):
+        found = record(capsys, *line, "--seed", str(seed))
+        drawn.append(found["problem"]["landmarks"])
+        assert len(set(drawn[-1]) - {0, 11, 24}) == 12
+    assert len(set(map(tuple, drawn))) == 20
+    assert record(capsys, *line, "--seed", "3")["problem"]["landmarks"] == drawn[3]
+    room = mapp_env.make_grid().reachable.size - 2
+    found = record(capsys, *line, "--n-landmarks", str(room))
+    assert len(found["problem"]["landmarks"]) == room
+
+
 def test_solve_writes_what_it_prints(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The plan file is the JSON object printed, and loads as the plan; the picture is there."""
     options = ["--landmarks", *CELLS, "--out", "plan.json", "--picture", "a.gif"]
@@ -431,6 +466,14 @@ def test_a_policy_of_another_grid_is_refused(
             "render --out a.gif --seed 9223372036854775808",
             r"--seed must be .*775807",
         ),
+        ("solve --starts 24 24 --n-agents 3", "--starts must hold 3 cells"),
+        ("solve --landmarks 0 6 --starts 3 6", r"starts\[1\] must not be a landmark"),
+        ("solve --landmarks 0 6 --starts 3 8", r"starts\[1\] must be a free cell"),
+        ("solve --starts 3 49", r"starts\[1\] must be a cell in 0\.\.48"),
+        ("solve --starts a", "--starts: 'a' is neither a number nor ROW,COL"),
+        ("solve --starts 0 --n-landmarks 40", r"--n-landmarks must be an integer in 1\.\.39"),
+        ("solve --problem bad.json --starts 1", "--starts does not go with a problem file"),
+        ("render --out a.gif --plan bad.json --starts 1", "--starts does not go with a plan file"),
         ("solve --landmarks 1 --seed 9223372036854775808", "--seed must be an integer"),
         ("solve --grid rooms --grid-seed -1", "--grid-seed must be an integer"),
         ("solve --out a.gif --picture a.gif", "--picture must be another file than --out"),

@@ -684,7 +684,8 @@ def test_landmark_option_takes_cells_and_pairs(as_pairs: bool) -> None:
     cells = [48, 0, 42, 6, 20]
     given: Any = [(cell // 7, cell % 7) for cell in cells] if as_pairs else cells
     env = mapp_v0.parallel_env()
-    env.reset(seed=0, options={"landmarks": given, "unknown": 1})
+    with pytest.warns(UserWarning, match="'unknown'"):
+        env.reset(seed=0, options={"landmarks": given, "unknown": 1})
     assert env.state()[3:8].tolist() == cells
     problem = mapp_env.Problem(mapp_env.make_grid("paper-7x7"), tuple(cells), n_agents=3)
     env.reset(options={"problem": problem})

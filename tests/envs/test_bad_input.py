@@ -154,21 +154,21 @@ SHAPES = {4096: (64, 64), 4097: (17, 241)}  # of grids with so many cells
 
 # Name, largest allowed value, and what takes it.
 LIMITS: dict[str, tuple[str, int, Callable[[int], Any]]] = {
-    "rows": ("walls", 512, lambda n: mapp_env.Grid(np.zeros((n, 1), bool))),
-    "columns": ("walls", 512, lambda n: mapp_env.Grid(np.zeros((1, n), bool))),
-    "rows of a text": ("rows", 512, lambda n: mapp_env.Grid.from_text("..\n" * n)),
-    "columns of a text": ("columns", 512, lambda n: mapp_env.Grid.from_text("." * n)),
+    "rows": ("walls", 2048, lambda n: mapp_env.Grid(np.zeros((n, 1), bool))),
+    "columns": ("walls", 2048, lambda n: mapp_env.Grid(np.zeros((1, n), bool))),
+    "rows of a text": ("rows", 2048, lambda n: mapp_env.Grid.from_text("..\n" * n)),
+    "columns of a text": ("columns", 2048, lambda n: mapp_env.Grid.from_text("." * n)),
     "height": (
         "height",
-        512,
+        2048,
         lambda n: mapp_env.Grid.from_text(f"type octile\nheight {n}\nwidth 1\nmap\n" + ".\n" * n),
     ),
     "characters of a text": (
-        "characters", 1 << 20, lambda n: mapp_env.Grid.from_text("D." + "\n" * (n - 2))
+        "characters", 8 << 20, lambda n: mapp_env.Grid.from_text("D." + "\n" * (n - 2))
     ),
     **{
         f"{side} of {kind}": (
-            side, 512, lambda n, kind=kind, side=side: mapp_env.make_grid(kind, **{side: n})
+            side, 2048, lambda n, kind=kind, side=side: mapp_env.make_grid(kind, **{side: n})
         )
         for kind in ("maze", "random", "rooms", "warehouse")
         for side in ("rows", "cols")
@@ -225,12 +225,12 @@ def test_a_gibibyte_is_allowed(arguments: dict[str, Any], size: int) -> None:
 
 
 def test_the_largest_file_is_read(tmp_path: Path) -> None:
-    """A map file of exactly a mebibyte is read, one of a byte more is not."""
+    """A map file of exactly eight mebibytes is read, one of a byte more is not."""
     path = tmp_path / "large.map"
-    path.write_text("D." + "\n" * ((1 << 20) - 2))
+    path.write_text("D." + "\n" * ((8 << 20) - 2))
     assert mapp_env.Grid.load(path) == mapp_env.Grid.from_text("D.")
-    path.write_text("D." + "\n" * ((1 << 20) - 1))
-    with pytest.raises(mapp_env.MapError, match=r"large\.map: has 1048577 bytes"):
+    path.write_text("D." + "\n" * ((8 << 20) - 1))
+    with pytest.raises(mapp_env.MapError, match=r"large\.map: has 8388609 bytes"):
         mapp_env.Grid.load(path)
 
 
@@ -783,13 +783,19 @@ BAD_TEXTS: dict[str, tuple[str, str]] = {
     "two depots side by side": ("...\n...\n.DD\n", "3"),
     "two depots": ("D..\n...\n..D\n", "3"),
     "walls only": ("###\n###\n", ""),
-    "513 wide": ("." * 513 + "\n", "513"),
-    "513 high": (".\n" * 513, "513"),
+    "2049 wide": ("." * 2049 + "\n", "2049"),
+    "2049 high": (".\n" * 2049, ":2049: has more than 2048 rows"),
     "null": ("D.\0\n", "1"),
     "inner blank line": ("D..\n\n...\n", "2"),
     "header lies about height": ("type octile\nheight 3\nwidth 3\nmap\n...\n...\n", "3"),
     "header lies about width": ("type octile\nheight 2\nwidth 4\nmap\n...\n...\n", "4"),
     "header is absurd": ("type octile\nheight 1000000000\nwidth 9\nmap\n...\n", "1000000000"),
+    "header of 2049 rows": (
+        "type octile\nheight 2049\nwidth 1\nmap\n" + ".\n" * 2049,
+        ":4: height must be in 1..2048, got '2049'",
+    ),
+    "millions of lines": ("D." + "\n." * 4_000_000, ":2049: has more than 2048 rows"),
+    "millions of words": ("type octile" + " x" * 4_000_000, ":1: expected a header line"),
     "header is negative": ("type octile\nheight -2\nwidth 3\nmap\n...\n...\n", "-2"),
     "header is no number": ("type octile\nheight two\nwidth 3\nmap\n...\n...\n", "two"),
     "header is fractional": ("type octile\nheight 2.0\nwidth 3\nmap\n...\n...\n", "2.0"),
@@ -858,11 +864,11 @@ def test_maps_that_are_read(case: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("header", "free", "walls"),
-    [("", ".G", "#@TO"), ("type octile\nheight 1\nwidth 3\nmap\n", ".GS", "#@TOW")],
+    [("", ".G", "#@TO"), ("type octile\nheight 1\nwidth 3\nmap\n", ".GSE", "#@TOW")],
     ids=["plain", "MovingAI"],
 )
 def test_every_letter_of_a_map(header: str, free: str, walls: str) -> None:
-    """Water is a wall, a swamp is free; no letter but these few, and the depot's, is a cell."""
+    """Water is a wall, swamps and stations are free; no other letter, but a depot's, is a cell."""
     for letter in map(chr, range(33, 127)):
         if letter in free + walls:
             grid = mapp_env.Grid.from_text(f"{header}D.{letter}")
@@ -949,7 +955,7 @@ def test_nasty_files(tmp_path: Path) -> None:
     (tmp_path / "folder.map").mkdir()
     (tmp_path / "binary.map").write_bytes(bytes(range(256)) * 8)
     (tmp_path / "utf16.map").write_bytes("D..\n".encode("utf-16"))
-    (tmp_path / "one-line.map").write_bytes(b"." * 900_000)
+    (tmp_path / "one-line.map").write_bytes(b"." * 8_000_000)
     (tmp_path / "link.map").symlink_to("/dev/zero")
     (tmp_path / "loop.map").symlink_to(tmp_path / "loop.map")
     names = sorted(str(path) for path in tmp_path.iterdir())

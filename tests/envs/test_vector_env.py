@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from model import OBSERVATIONS, landmark_cells
 
 import mapp_env
+from mapp_env import mapp_v0
 
 MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 
@@ -610,3 +611,43 @@ def test_seed_0_of_a_row_is_a_seed() -> None:
     envs.reset()
     assert np.array_equal(envs.reset(seed=[0, 1])[0], first)
     assert envs.np_random_seed == (0, 1)
+
+
+@pytest.mark.parametrize("observation", ["planes", "distances"])
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+def test_state_is_each_single_environments(mode: AutoresetMode, observation: str) -> None:
+    """state() has, whatever is observed, what single environments of the rows' seeds say of it.
+
+    It is fresh, and in next-step mode an ended row keeps its last state for one step.
+    """
+    arguments = settings(observation=observation)
+    envs = mapp_env.make_vec(3, autoreset_mode=mode, **arguments)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.state()
+    envs.reset(seed=4)
+    singles = [mapp_v0.parallel_env(**arguments) for _ in range(3)]
+    for single, seed in zip(singles, envs.np_random_seed, strict=True):
+        single.reset(seed=seed)
+    rng, ended, ends = np.random.default_rng(0), np.zeros(3, bool), 0
+    for _ in range(40):
+        state = envs.state()
+        assert state.dtype == np.float32
+        assert state.tolist() == [single.state().tolist() for single in singles]
+        state[:] = -1
+        if mode == AutoresetMode.DISABLED and ended.any():
+            envs.reset(options={"reset_mask": ended.copy()})
+            for row in np.flatnonzero(ended):
+                singles[row].reset()
+            ended[:] = False
+        actions = rng.integers(0, 4, (3, singles[0].task.n_agents))
+        terminations, truncations = envs.step(actions)[2:4]
+        for row, single in enumerate(singles):
+            if mode == AutoresetMode.NEXT_STEP and ended[row]:
+                single.reset()
+            else:
+                single.step(dict(zip(single.possible_agents, actions[row].tolist(), strict=True)))
+                if mode == AutoresetMode.SAME_STEP and not single.agents:
+                    single.reset()
+        ended = terminations | truncations
+        ends += int(ended.sum())
+    assert ends > 3

@@ -97,9 +97,9 @@ def test_extreme_options(name: str, options: dict[str, float]) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_largest_grids(name: str) -> None:
-    """512 x 512 cells are made, and connected."""
-    grid = make_grid(name, rows=512, cols=512, seed=1)
-    assert grid.walls.shape == (512, 512)
+    """2048 x 1024 cells are made, and connected."""
+    grid = make_grid(name, rows=2048, cols=1024, seed=1)
+    assert grid.walls.shape == (2048, 1024)
     assert grid.reachable.size + 1 == int((~grid.walls).sum())
 
 
@@ -205,11 +205,11 @@ def test_names() -> None:
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("random", {"rows": 513}, r"rows must be an integer in 2\.\.512, got 513"),
-        ("random", {"cols": 1}, r"cols must be an integer in 2\.\.512, got 1"),
-        ("rooms", {"rows": 8.0}, r"rows must be an integer in 3\.\.512, got 8\.0"),
-        ("maze", {"cols": 2}, r"cols must be an integer in 3\.\.512, got 2"),
-        ("warehouse", {"rows": True}, r"rows must be an integer in 6\.\.512, got True"),
+        ("random", {"rows": 2049}, r"rows must be an integer in 2\.\.2048, got 2049"),
+        ("random", {"cols": 1}, r"cols must be an integer in 2\.\.2048, got 1"),
+        ("rooms", {"rows": 8.0}, r"rows must be an integer in 3\.\.2048, got 8\.0"),
+        ("maze", {"cols": 2}, r"cols must be an integer in 3\.\.2048, got 2"),
+        ("warehouse", {"rows": True}, r"rows must be an integer in 6\.\.2048, got True"),
         ("maze", {"seed": -1}, "seed must be an integer in 0"),
         ("maze", {"seed": None}, "seed must be an integer in 0"),
         ("random", {"density": 0.41}, r"density must be a number in 0\.\.0\.4, got 0\.41"),
@@ -217,7 +217,7 @@ def test_names() -> None:
         ("random", {"density": "0.2"}, "density must be a number .* got '0.2'"),
         ("random", {"density": 10**400}, r"density must be a number in 0\.\.0\.4"),
         ("random", {"density": True}, "density must be a number .* got True"),
-        ("rooms", {"room": 1}, r"room must be an integer in 2\.\.256, got 1"),
+        ("rooms", {"room": 1}, r"room must be an integer in 2\.\.1024, got 1"),
         ("maze", {"loops": -0.1}, r"loops must be a number in 0\.\.1, got -0\.1"),
         ("warehouse", {"gaps": 1.5}, r"gaps must be a number in 0\.\.1, got 1\.5"),
         ("warehouse", {"aisle": 0}, r"aisle must be an integer in 1\.\.8, got 0"),

@@ -37,6 +37,7 @@ LAYERS: tuple[str, ...] = (
     "mapp_env.envs",
     "mapp_env.mapp_v0",
     "mapp_env.adapters",
+    "mapp_env.evaluation",
     "mapp_env",
     "mapp_env.commands",
     "mapp_env.__main__",

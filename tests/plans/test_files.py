@@ -85,9 +85,9 @@ def test_files_are_plain_json(tmp_path: Path) -> None:
 
 
 def test_the_largest_grid_fits(tmp_path: Path) -> None:
-    """A problem on a 512 x 512 grid is within the caps."""
-    grid = Grid(np.zeros((512, 512), bool))
-    problem = Problem(grid, (0, 512 * 512 - 1), 1)
+    """A problem on a 2048 x 2048 grid is within the caps."""
+    grid = Grid(np.zeros((2048, 2048), bool))
+    problem = Problem(grid, (0, 2048 * 2048 - 1), 1)
     problem.save(tmp_path / "problem.json")
     assert Problem.load(tmp_path / "problem.json") == problem
     plan = solve(problem)
@@ -388,9 +388,9 @@ def test_odd_files_are_refused(kind: str, tmp_path: Path) -> None:
         load(kind, 3)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("kind", "limit"), [("problem", 1 << 20), ("plan", 16 << 20)])
+@pytest.mark.parametrize(("kind", "limit"), [("problem", 8 << 20), ("plan", 24 << 20)])
 def test_files_have_a_size(kind: str, limit: int, tmp_path: Path) -> None:
-    """A file of exactly a mebibyte, or sixteen for a plan, is read; one of a byte more is not."""
+    """A file of exactly eight mebibytes, or 24 for a plan, is read; one of a byte more is not."""
     fields = fields_of(kind, tmp_path)
     path = tmp_path / "large.json"
     path.write_text(json.dumps(fields).ljust(limit))

@@ -109,6 +109,16 @@ def test_cells_are_scaled_down(tmp_path: Path, side: int, most: int) -> None:
     assert height <= most + 40
 
 
+def test_large_maps_are_animated(tmp_path: Path) -> None:
+    """On 2048 x 2048 cells a picture is as large as asked for, and a hundred steps have room."""
+    grid = mapp_env.Grid(np.zeros((2048, 2048), bool))
+    problem = mapp_env.Problem(grid, (grid.depot + 40, 0), 1)
+    save_animation(tmp_path / "a.gif", problem, [[1]] * 100, max_side=256)
+    frames, _, _ = read(tmp_path / "a.gif")
+    assert max(frames[0].shape) <= 256 + 40
+    assert len(frames) == 101
+
+
 @pytest.mark.parametrize("n_colours", [1, 2, 3, 254, 255])
 def test_up_to_255_colours_are_exact(tmp_path: Path, n_colours: int) -> None:
     """Frames of few colours come back to the bit, whatever changes from one to the next."""

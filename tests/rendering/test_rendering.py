@@ -21,7 +21,7 @@ from mapp_env.grid import Grid
 from mapp_env.plans.plan import Plan
 from mapp_env.problem import Problem
 from mapp_env.rendering import Scene, ansi, draw_plan, rgb_array
-from mapp_env.rendering.palette import AGENTS, FLAG, FLAG_VISITED, agent_colour, to_hex
+from mapp_env.rendering.palette import AGENTS, FLAG, FLAG_VISITED, FLOOR, WALL, agent_colour, to_hex
 
 GRID = Grid.from_text(".......\n.##..#.\n.....#.\n..#D...\n.....#.\n.#.....\n...#...\n")
 LANDMARKS = (0, 6, 20, 42, 48)
@@ -243,7 +243,10 @@ def test_shared_trails_are_all_seen() -> None:
 
 @pytest.mark.parametrize(
     ("rows", "cols", "n_landmarks"),
-    [(1, 2, 1), (2, 1, 1), (1, 512, 64), (512, 1, 64), (512, 512, 64), (9, 9, 64)],
+    [
+        *[(1, 2, 1), (2, 1, 1), (1, 512, 64), (512, 1, 64), (512, 512, 64), (9, 9, 64)],
+        *[(1, 2048, 64), (2048, 1, 64), (2048, 2048, 64), (656, 1491, 64)],
+    ],
 )
 def test_extreme_grids(rows: int, cols: int, n_landmarks: int) -> None:
     """The smallest, longest and largest grids with the most agents and landmarks are drawn."""
@@ -256,6 +259,32 @@ def test_extreme_grids(rows: int, cols: int, n_landmarks: int) -> None:
     assert max(frames[0].shape[:2]) <= 1080
     assert not np.array_equal(*frames)
     assert ansi(scenes[-1]).count("\n") >= rows
+
+
+@pytest.mark.parametrize(("side", "merged"), [(1024, 2), (400, 3), (16, 75)])
+def test_cells_of_large_grids_share_pixels(side: int, merged: int) -> None:
+    """A pixel has the mean colour of its square of cells; signs stand on their cells' pixels."""
+    walls = np.random.default_rng(3).random((1030, 1200)) < 0.3
+    walls[:8, :8] = walls[500:540, 500:540] = False
+    grid = Grid(walls, (520, 520))
+    scene = without_trails(start(grid, (0,), 1))
+    frame = rgb_array(scene, side)
+    height, width = -(-1030 // merged), -(-1200 // merged)
+    assert max(height, width) <= side
+    top, left = (frame.shape[0] - 32 - height) // 2, (frame.shape[1] - width) // 2
+    seen = frame[top : top + height, left : left + width]
+    padded = np.full((height * merged, width * merged), np.nan)
+    padded[:1030, :1200] = walls
+    shares = np.nanmean(padded.reshape(height, merged, width, merged), axis=(1, 3))[:, :, None]
+    means = shares * np.array(WALL) + (1 - shares) * np.array(FLOOR)
+    wrong = (abs(seen - means) > 1).any(axis=2)
+    signs = np.zeros((height, width), bool)
+    for row, col in ((0, 0), (520 // merged, 520 // merged)):
+        signs[max(row - 30, 0) : row + 30, max(col - 30, 0) : col + 30] = True
+    assert not (wrong & ~signs).any()
+    if side > 100:
+        assert wrong[:20, :20].any()
+        assert wrong[520 // merged - 5 :, 520 // merged - 5 :][:10, :10].all()
 
 
 def test_long_trails_are_drawn_up_to_a_limit() -> None:

@@ -26,7 +26,7 @@ from mapp_env.solvers import exact, solve_universe
 from mapp_env.solvers.batch import least_worst
 from mapp_env.solvers.bounds import lower_bound, tree_bound
 from mapp_env.solvers.held_karp import route_costs, shortest_routes
-from mapp_env.solvers.solution import landmark_distances
+from mapp_env.solvers.solution import landmark_distances, problem_distances
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 SHAPES = ((7, 7), (1, 9), (12, 1), (2, 5), (5, 3), (4, 11), (3, 3), (9, 6), (2, 2), (10, 10))
@@ -376,7 +376,7 @@ def test_bound_below_optimum_below_policies() -> None:
     tight = solved = 0
     for _ in range(150):
         problem = random_problem(rng, 8, 4)
-        distances = landmark_distances(problem)
+        distances = problem_distances(problem)
         actions = rng.integers(0, 5, (300, problem.n_agents))
         for objective in OBJECTIVES:
             optimum = solve(problem, objective, "exact").cost
@@ -397,14 +397,13 @@ def test_bound_is_the_optimum_of_few_landmarks() -> None:
     raised = 0
     for _ in range(30):
         problem = random_problem(rng, 14, 6, (9, 9), 10)
-        distances = landmark_distances(problem)
+        distances = problem_distances(problem)
         for objective in OBJECTIVES:
             optimum = solve(problem, objective, "exact").cost
             bound = lower_bound(problem, objective, distances)
-            closed = objective != "cover_time"
-            teams = 1 if objective == "total_distance" else problem.n_agents
-            low = tree_bound(distances, teams, closed)
-            assert distances[0].max() * (2 if closed else 1) <= low <= bound <= optimum
+            low = tree_bound(distances, objective)
+            there = distances.between[0].max() * (1 if objective == "cover_time" else 2)
+            assert there <= low <= bound <= optimum
             assert bound == optimum or len(problem.landmarks) > 12
             raised += low < bound and len(problem.landmarks) > 12
     assert raised > 5

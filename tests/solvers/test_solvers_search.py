@@ -20,7 +20,7 @@ from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
 from mapp_env.solvers.ruin_recreate import recreate
 from mapp_env.solvers.search import Search, solve_search
-from mapp_env.solvers.solution import Solution, landmark_distances, solution_of
+from mapp_env.solvers.solution import Solution, landmark_distances, problem_distances, solution_of
 
 OBJECTIVES = ("cover_time", "makespan", "total_distance")
 needs_pyvrp = pytest.mark.skipif(
@@ -118,7 +118,7 @@ def test_search_takes_all_sizes(objective: str, n_landmarks: int, n_agents: int)
     problem = generated_problem("rooms", 24, n_landmarks, n_agents, 5)
     found = solve_search(problem, objective, iterations=300)
     cost = costs(problem, found)[objective]
-    assert found.bound == lower_bound(problem, objective, landmark_distances(problem))
+    assert found.bound == lower_bound(problem, objective, problem_distances(problem))
     assert found.bound <= cost
     assert found.optimal == (cost == found.bound)
     plan = solve(problem, objective, method="search", time_limit=0.01)
