@@ -163,6 +163,7 @@ def test_games_are_not_vacuous() -> None:
         seen["sizes"] += len(shapes) > 2
         seen["one size"] += len(shapes) == 1 < len(set(game.pool))
         seen[game.actions, game.return_home, game.reward] += 1
+        seen["face", seed % 3, game.reward] += len(game.pool) > 1
         seen[game.actions, kind_of(seed)] += 1
         seen["pocket"] += any(
             sum(row.count(".") for row in rows) > len(mapp_env_cells(rows)) for rows in game.pool
@@ -170,7 +171,7 @@ def test_games_are_not_vacuous() -> None:
         seen["N", game.n_agents] += 1
         seen["K", game.n_landmarks] += 1
         seen["pool", len(game.pool)] += 1
-    assert len(seen) == 8 + 12 + 2 * len(OBSERVATIONS) + 6 + 6 + 8 + 5
+    assert len(seen) == 8 + 12 + 9 + 2 * len(OBSERVATIONS) + 6 + 6 + 8 + 5
     assert all(count >= 2 for count in seen.values()), seen
 
 
