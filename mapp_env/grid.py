@@ -212,6 +212,8 @@ class Grid:
     def _cells(self, cells: Iterable[int]) -> NDArray[np.int32]:
         if not isinstance(cells, Iterable):
             raise ValueError(f"cells must be a sequence of cells, got {describe(cells)}")
+        if isinstance(cells, range) and cells == range(self.n_cells):
+            return np.arange(self.n_cells, dtype=np.int32)
         return np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
 
     def _centre(self) -> int:

@@ -11,9 +11,9 @@ from mapp_env.evaluation.episodes import Moments
 from mapp_env.evaluation.problems import Group
 from mapp_env.evaluation.progress import Progress
 from mapp_env.solvers import optimal_costs, solve
-from mapp_env.solvers.batch import MAX_BATCH_LANDMARKS
 from mapp_env.solvers.bounds import lower_bound
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS
+from mapp_env.solvers.oracle.states import MAX_BATCH_LANDMARKS
 from mapp_env.solvers.solution import problem_distances
 
 MAX_REGRET_LANDMARKS = MAX_BATCH_LANDMARKS
