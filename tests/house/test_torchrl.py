@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from model import OBSERVATIONS
+from pettingzoo.utils import BaseParallelWrapper
 from tensordict import TensorDictBase
 
 import mapp_env
@@ -52,7 +54,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 @pytest.mark.parametrize("use_mask", [False, True])
-@pytest.mark.parametrize("observation", ["global", "own_first", "planes", "geodesic"])
+@pytest.mark.parametrize("observation", OBSERVATIONS)
 def test_specs(observation: str, use_mask: bool) -> None:
     """TorchRL's check passes for each observation, without and with a mask of living agents."""
     check_env_specs(wrap(use_mask, observation=observation, allow_wait=use_mask), seed=3)
@@ -165,6 +167,53 @@ def test_transitions_arrive_to_the_bit(observation: str) -> None:
         assert row["next", "done"].tolist() == [step["ended"]]
         ends.add((bool(row["next", "terminated"]), bool(row["next", "truncated"])))
     assert ends == {(False, False), (True, False), (False, True)}
+
+
+class MasksAlone(BaseParallelWrapper):
+    """The environment, with infos that hold nothing but the action masks."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Return observations and masks."""
+        observations, infos = super().reset(seed, options)
+        return observations, self.without_others(infos)
+
+    def step(self, actions: dict[str, int]) -> Any:
+        """Return all else as it is."""
+        *results, infos = super().step(actions)
+        return *results, self.without_others(infos)
+
+    def without_others(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Return the masks."""
+        return {agent: {"action_mask": info["action_mask"]} for agent, info in infos.items()}
+
+
+@pytest.mark.parametrize("home", [False, True])
+@pytest.mark.parametrize("actions", ["moves", "landmarks"])
+def test_pools_arrive_to_the_bit(actions: str, home: bool) -> None:
+    """Without grids and metrics in infos, TorchRL plays pools, landmark actions and ways home."""
+    arguments: dict[str, Any] = {
+        "grid": [mapp_env.make_grid(), mapp_env.Grid.from_text("...\n.D.\n")],
+        "observation": "distances",
+        "n_landmarks": 2,
+        "max_cycles": 9,
+        "actions": actions,
+        "return_home": home,
+    }
+    env = PettingZooWrapper(
+        MasksAlone(mapp_v0.parallel_env(**arguments)), categorical_actions=True, return_state=True
+    )
+    check_env_specs(env, seed=3)
+    ends = 0
+    played = collect(env, 5, 150)
+    for row, step in zip(played, scalar_steps(played, 5, **arguments), strict=True):
+        group, names = row["next", "agent"], step["names"]
+        assert torch.equal(row["agent", "observation"], torch.as_tensor(step["observation"]))
+        assert torch.equal(group["observation"], torch.as_tensor(step["next observation"]))
+        assert torch.equal(row["agent", "action_mask"], torch.as_tensor(step["action_mask"] != 0))
+        assert group["reward"][:, 0].tolist() == [step["rewards"][name] for name in names]
+        assert row["next", "done"].tolist() == [step["ended"]]
+        ends += step["ended"]
+    assert ends > 3
 
 
 def test_last_masks_are_made_again(example: ModuleType) -> None:
