@@ -25,7 +25,7 @@ from mapp_env.engine.state import (
     unpack,
     world_at,
 )
-from mapp_env.grid import fill_distances
+from mapp_env.paths import fill_distances
 
 # Arrays, for signatures of one line.
 Int32s = NDArray[np.int32]

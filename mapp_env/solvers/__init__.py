@@ -16,6 +16,7 @@ from mapp_env.problem import Problem
 from mapp_env.solvers.batch import optimal_costs, solve_universe
 from mapp_env.solvers.bounds import tree_bound
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
+from mapp_env.solvers.oracle import next_costs, next_costs_of, regrets
 from mapp_env.solvers.solution import Distances, Routes, Solution, Solver
 from mapp_env.solvers.vrplib import save_vrplib
 from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, describe
@@ -23,7 +24,10 @@ from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, de
 __all__ = [
     "METHODS",
     "Solution",
+    "next_costs",
+    "next_costs_of",
     "optimal_costs",
+    "regrets",
     "save_vrplib",
     "solve",
     "solve_many",

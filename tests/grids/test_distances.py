@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapp_env import Grid
-from mapp_env.grid import fill_distances
+from mapp_env.paths import fill_distances
 
 
 def steps_from(walls: NDArray[np.bool_], start: int) -> list[int]:
