@@ -209,7 +209,7 @@ PLAN = solve(PROBLEM)
 
 
 def test_tours_begin_at_the_agents_own_start() -> None:
-    """A tour from elsewhere, the depot or the other agent's start, or without its end is refused."""
+    """A tour from elsewhere, even the depot or the other start, or without its end is refused."""
     assert [tour[0] for tour in PLAN.tours] == [3, 8]
     for tours in (
         PLAN.tours[::-1],
