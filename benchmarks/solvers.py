@@ -9,6 +9,7 @@ every decision, and to prove an optimum.
 
     python benchmarks/solvers.py            # five minutes; quick: --seconds 0.2 --instances 1
     python benchmarks/solvers.py --grid rooms --objective makespan
+    python benchmarks/solvers.py --many 1000    # solve_many on so many problems
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import numpy as np
 
 from mapp_env import Problem, make_grid
 from mapp_env.plans.plan import OBJECTIVES
-from mapp_env.solvers import next_costs, next_costs_of, optimal_costs
+from mapp_env.solvers import next_costs, next_costs_of, optimal_costs, solve_many
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
@@ -220,6 +221,23 @@ def time_apart(kind: str, instances: int) -> None:
             )
 
 
+def measure_many(count: int, kind: str) -> None:
+    """Print what `solve_many` takes for each of many problems, each on a map of its own."""
+    problems = [draw_problem(kind, 32, 20, 5, seed) for seed in range(count)]
+    solve_many(problems[:20])  # compile and load kernels
+    print(f"{count} problems of 32x32 / 20 / 5 on {kind} grids, cover time\n")
+    print("solve_many with        | ms each, in all | mean cost | of these proven")
+    print("|".join("-" * width for width in (23, 17, 11, 16)))
+    for options in ({"time_limit": 0.001}, {"iterations": 500}, {"time_limit": 0.02}):
+        start = time.perf_counter()
+        plans = solve_many(problems, **options)
+        each = 1000 * (time.perf_counter() - start) / count
+        name = ", ".join(f"{option}={value}" for option, value in options.items())
+        proven = sum(plan.status == "optimal" for plan in plans)
+        cost = mean(plan.cost for plan in plans)
+        print(f"{name:<22} | {each:15.2f} | {cost:9.2f} | {proven:4d}/{count}", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -227,7 +245,11 @@ def main() -> None:
     parser.add_argument("--instances", type=int, default=3, help="problems per size")
     parser.add_argument("--grid", default="random", help="generator of the larger grids")
     parser.add_argument("--objective", choices=OBJECTIVES, help="only this one")
+    parser.add_argument("--many", type=int, metavar="P", help="only solve_many, on P problems")
     args = parser.parse_args()
+    if args.many is not None:
+        measure_many(args.many, args.grid)
+        return
     # Compile and load kernels before timing.
     for objective in OBJECTIVES:
         compare([draw_problem(args.grid, 7, 3, 2, 0)], objective, 0.01)
