@@ -24,7 +24,6 @@ import torch
 from torch import Tensor
 
 from baselines.learning.config import Units, UnitsOrNone, own_options, run_script
-from baselines.learning.exact_values import steps_left
 from baselines.learning.imitation import Imitation, ImitationOptions, good_actions_loss, start_of
 from baselines.learning.ranges import Share, Within
 from baselines.learning.train import run_training
@@ -43,6 +42,7 @@ from baselines.runs.checkpoints import part
 from mapp_env import Grid
 from mapp_env.grid import MAX_ALL_PAIRS_CELLS
 from mapp_env.grids import find_grid
+from mapp_env.solvers.oracle.decisions import action_costs
 from mapp_env.validation import check_count
 
 ALGORITHM = "distill"
@@ -116,7 +116,7 @@ class Distilled(Imitation):
         # Here the grid may be read, as the solver reads it, too.
         reached = np.append(grid.reachable, grid.depot)
         self.states.moves[reached] = np.asarray(grid.moves)[reached, :N_ACTIONS]
-        self.distances = np.asarray(grid.distances, np.int64)
+        self.grid = grid
         self.mistakes = np.zeros((0, spec.observation_size), np.float32)  # the oldest first
 
     def batch_loss(self) -> Tensor:
@@ -127,7 +127,7 @@ class Distilled(Imitation):
         obs = np.concatenate((states.observations(), again))
         whole = obs.astype(np.int64)
         cells, landmarks, flags = np.split(whole, (n, n + self.spec.n_landmarks), axis=1)
-        steps = steps_left(cells, landmarks, flags > 0, states.moves, self.distances)
+        steps = action_costs(self.grid, landmarks, flags == 0, cells, states.moves)
         scores = self.network(torch.from_numpy(obs))
         joint = scores.argmax(1).numpy()
         wrong = steps[np.arange(len(obs)), joint] > steps.min(axis=1)

@@ -10,7 +10,9 @@ solved; of the cover time the mean gap to the proven optimum, the share of optim
 largest gap; and the means of all three costs. A problem is solved when every landmark was visited
 within the step limit; gaps and costs are those of the solved problems, and the cover time is shown
 a second time over all problems, an unsolved one counted with the step limit. Optima are proven up
-to 20 landmarks; beyond, there are no gaps.
+to 20 landmarks; beyond, there are no gaps. Below the table: for each policy the regret, the mean
+number of steps by which a decision makes the optimum of what is left longer than it was, and which
+shares of it were lost at the first decision, later, and with one landmark left.
 
 The rules of thumb: "nearest landmark", in which each agent walks to the unvisited landmark nearest
 to itself, whatever the others do; and "earliest arrival", which gives each landmark to the agent
@@ -38,6 +40,7 @@ from baselines.policies.evaluation import (
     find_optima,
     format_table,
     out_of_reach,
+    regret_lines,
     save_table,
     unseen_problems,
 )
@@ -115,7 +118,7 @@ def main(args: Args) -> None:
         for name, acting in {label: policy, **rules_of_thumb(setting)}.items()
     }
     print(format_table(table))
-    for line in worst_cases(table[label]):
+    for line in (*worst_cases(table[label]), *regret_lines(table)):
         print(line)
     if args.out is not None:
         save_table(args.out, table)

@@ -215,7 +215,10 @@ class Grid:
     def _cells(self, cells: Iterable[int]) -> NDArray[np.int32]:
         if not isinstance(cells, Iterable):
             raise ValueError(f"cells must be a sequence of cells, got {describe(cells)}")
-        starts = np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
+        if isinstance(cells, range) and cells == range(self.n_cells):
+            starts = np.arange(self.n_cells, dtype=np.int32)
+        else:
+            starts = np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
         size = 4 * len(starts) * self.n_cells
         if size > MAX_LINES_BYTES:
             raise ValueError(

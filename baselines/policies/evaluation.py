@@ -17,9 +17,10 @@ from baselines.policies.acting import Acting
 from baselines.policies.settings import Setting
 from mapp_env import Plan, Problem, replay, sample_problems
 from mapp_env.evaluation.episodes import BATCH, Moments, play_episodes
-from mapp_env.evaluation.optima import proven_costs
+from mapp_env.evaluation.optima import find_losses, proven_costs
 from mapp_env.evaluation.problems import enough_steps, group_problems
 from mapp_env.evaluation.progress import Progress
+from mapp_env.evaluation.summary import losses_line, lost_figures
 from mapp_env.files import write_text
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_CYCLES
@@ -30,6 +31,7 @@ from mapp_env.validation import check_count
 # Every policy meets the same problems unless another seed is asked for. Trainings draw theirs
 # from streams spawned from their own seeds; those that coincide are left out one by one.
 EVALUATION_SEED = 0
+MAX_JUDGED = 10_000  # problems of an evaluation whose decisions are judged
 N_ROUTES = 2  # problems of an evaluation whose routes are drawn: the first ones
 MAX_TABLE_BYTES = 1 << 20
 
@@ -225,6 +227,30 @@ def play(policy: Acting, problems: Sequence[Problem], max_cycles: int | None = N
             problem = replace(problems[place], max_cycles=limits[place])
             plans[place] = replay(problem, episodes.actions[: episodes.steps[row], row])
     return [plans[place] for place in range(len(problems))]
+
+
+# -- regrets -----------------------------------------------------------------------------------
+
+
+def regret_lines(evaluations: dict[str, Evaluation]) -> list[str]:
+    """Return lines on what each policy's decisions lost; none without optima.
+
+    Of more than 10,000 problems a sample is judged, spread evenly, and a line says so.
+    """
+    first = next(iter(evaluations.values()))
+    if first.optima is None:
+        return []
+    n_problems = len(first.landmarks)
+    rows = np.arange(0, n_problems, -(-n_problems // MAX_JUDGED))
+    lines = []
+    if len(rows) < n_problems:
+        lines = [f"regrets are those of {len(rows):,} problems, spread evenly among all"]
+    for label, evaluation in evaluations.items():
+        group = evaluation.setting.group(evaluation.landmarks[rows])
+        moments = Moments(*(part[:, rows] for part in evaluation.moments))
+        losses = find_losses(group, moments, first.optima.cover_time[rows])
+        lines.append(f"{label}: {losses_line(lost_figures(losses, evaluation.steps[rows]))}")
+    return lines
 
 
 # -- tables ------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ For example:
     python -m mapp_env evaluate --policy pretrained --problems problems
   a policy of one's own, made by load(name) in mine.py, that sees what no map's size changes
     python -m mapp_env evaluate --policy a --policy-loader mine:load --observation geodesic
-  on twenty problems of a building with rooms, for a program
-    python -m mapp_env evaluate --policy a --policy-loader mine:load --grid rooms --json
+  one that must bring everybody home, in a building with rooms
+    python -m mapp_env evaluate --policy a --policy-loader mine:load --grid rooms --return-home
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mapp_env.commands.problem_options import (
 from mapp_env.commands.reports import add_json_option, print_report, words
 from mapp_env.evaluation import evaluate
 from mapp_env.evaluation.problems import load_problems
-from mapp_env.evaluation.summary import LOSSES, losses_line, summarise
+from mapp_env.evaluation.summary import losses_line, summarise
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import Problem, sample_problems
 
@@ -47,9 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--objective",
         choices=OBJECTIVES,
-        default=OBJECTIVES[0],
-        help=f"what a problem's cost is (default {OBJECTIVES[0]})",
+        help="what a problem's cost is (default cover_time; makespan with --return-home)",
     )
+    add("--return-home", action="store_true", help="an episode goes on until all are home")
     add(
         "--max-cycles",
         type=int,
@@ -78,12 +78,15 @@ def run(arguments: argparse.Namespace) -> None:
     """
     problems = _problems_of(arguments)
     policy = policy_of(arguments)
-    given = {"objective": arguments.objective, "max_cycles": arguments.max_cycles}
-    found = evaluate(policy, problems, **given, **environment_of(arguments))
+    home = arguments.return_home
+    objective = arguments.objective or ("makespan" if home else "cover_time")
+    options = {"max_cycles": arguments.max_cycles, "return_home": home, **environment_of(arguments)}
+    found = evaluate(policy, problems, objective, **options)
     figures = summarise(found)
-    record: dict[str, Any] = {"objective": arguments.objective, **_plain(figures)}
+    record: dict[str, Any] = {"objective": objective, **_plain(figures)}
+    record |= {"n_problems": len(problems)}
     record["problems"] = {name: _listed(values) for name, values in found.items()}
-    print_report(arguments, record, _lines(arguments.objective, problems, found, figures))
+    print_report(arguments, record, _lines(objective, problems, found, figures))
 
 
 def _problems_of(arguments: argparse.Namespace) -> list[Problem]:
@@ -101,6 +104,8 @@ def _problems_of(arguments: argparse.Namespace) -> list[Problem]:
                 "--n-problems is how many to draw: it does not go with a problem that is given"
             )
         return [problem_of(arguments)]
+    if arguments.starts is not None:
+        raise ValueError("--starts is for a problem that is given, by --landmarks or a file")
     grid = grid_of(arguments)
     n_problems, n_landmarks, n_agents = (
         default if given is None else given
@@ -149,10 +154,8 @@ def _lines(
                 f"{found['cost'][worst]:.0f}, optimum {optimum[worst]:.0f}, "
                 f"{_landmarks(problems[worst])}",
             ]
-    known = ~np.isnan(found["regret"])
-    if known.any():
-        losses = np.array([found[name][known] for name in LOSSES])
-        lines.append(losses_line(losses, found["steps"][known]))
+    if not math.isnan(figures["regret"]):
+        lines.append(losses_line(figures))
     return lines
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
+
+from numpy.typing import ArrayLike
 
 from mapp_env.files import check_writable
 from mapp_env.plans.plan import Plan
@@ -16,6 +17,14 @@ PICTURES = (*ANIMATIONS, *FIGURES)
 DEFAULT_FPS = 4.0
 
 
+class Writer(Protocol):
+    """Draws a plan into a file."""
+
+    def __call__(self, problem: Problem, plan: Plan, regrets: ArrayLike | None = None) -> int:
+        """Draw it, and what each step lost, if that is given; return how many bytes that took."""
+        ...
+
+
 def check_file(option: str, out: str) -> str:
     """Return what a path leads to; raise ValueError, for the option, if no file can be there."""
     try:
@@ -24,10 +33,8 @@ def check_file(option: str, out: str) -> str:
         raise ValueError(f"{option} {error}") from error
 
 
-def picture_writer(
-    option: str, out: str, fps: float | None = None
-) -> Callable[[Problem, Plan], int]:
-    """Return what draws a plan into the file ``out``, and says how many bytes that took.
+def picture_writer(option: str, out: str, fps: float | None = None) -> Writer:
+    """Return what draws a plan into the file ``out``.
 
     What stands in the way is said here, before anybody searches for a plan. ``option`` is what
     messages call the file; ``fps``, frames a second, is for animations.
@@ -45,12 +52,19 @@ def picture_writer(
         from mapp_env.rendering import save_animation
 
         rate = DEFAULT_FPS if fps is None else fps
-        return lambda problem, plan: save_animation(out, problem, plan.actions, rate)
+
+        def animate(problem: Problem, plan: Plan, regrets: ArrayLike | None = None) -> int:
+            if regrets is None:
+                return save_animation(out, problem, plan.actions, rate)
+            return save_animation(out, problem, plan.actions, rate, regrets=regrets)
+
+        return animate
 
     from mapp_env.rendering import draw_plan, save_figure
 
-    def draw_figure(problem: Problem, plan: Plan) -> int:
-        figure: Any = draw_plan(problem, plan).figure  # as no axes were given, all of one
+    def draw_figure(problem: Problem, plan: Plan, regrets: ArrayLike | None = None) -> int:
+        # As no axes were given, the figure is all of one.
+        figure: Any = draw_plan(problem, plan, regrets=regrets).figure
         return save_figure(figure, out)
 
     return draw_figure

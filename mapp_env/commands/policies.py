@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from mapp_env.engine.observation import Observation
+from mapp_env.engine.task import ACTIONS
 from mapp_env.evaluation.episodes import play_episodes
 from mapp_env.evaluation.policies import Policy, refusing
 from mapp_env.evaluation.problems import group_problems
@@ -24,6 +25,7 @@ from mapp_env.problem import Problem
 from mapp_env.validation import describe
 
 DEFAULT_LOADER = "baselines.policy:load_policy"
+ENVIRONMENT = ("observation", "actions", "allow_wait")  # options of a policy's environment
 OBSERVATIONS = tuple(kind.name.lower() for kind in Observation)
 
 
@@ -48,6 +50,13 @@ def add_policy_options(parser: argparse.ArgumentParser, required: bool = True) -
         choices=OBSERVATIONS,
         help=f"what the policy sees (default {OBSERVATIONS[0]}: (B, N + 2K))",
     )
+    add(
+        "--actions",
+        choices=ACTIONS,
+        help=f"what it acts with: moves, or landmarks to walk towards (default {ACTIONS[0]})",
+    )
+    # None, not False, where it was not given: as of all options.
+    add("--allow-wait", action="store_true", default=None, help="agents may wait: action 4")
 
 
 def policy_of(arguments: argparse.Namespace) -> Policy:
@@ -57,7 +66,8 @@ def policy_of(arguments: argparse.Namespace) -> Policy:
 
 def environment_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of the environment that the options tell."""
-    return {"observation": arguments.observation or OBSERVATIONS[0]}
+    given = {name: getattr(arguments, name) for name in ENVIRONMENT}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def load_policy(name: str, loader: str = DEFAULT_LOADER) -> Policy:

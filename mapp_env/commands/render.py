@@ -13,6 +13,8 @@ For example:
     python -m mapp_env render --out plan.png --plan plan.json
   a trained policy, by its name or run folder
     python -m mapp_env render --out policy.gif --policy pretrained --landmarks 0 6 20 42 48
+  the same as a figure, the moves marked that the optimum would not have made
+    python -m mapp_env render --out policy.png --policy pretrained --n-landmarks 5 --show-regret
 """
 
 from __future__ import annotations
@@ -20,11 +22,14 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
+import numpy as np
 from gymnasium.utils import seeding
+from numpy.typing import NDArray
 
 from mapp_env.commands import problem_options, reports
 from mapp_env.commands.pictures import DEFAULT_FPS, PICTURES, picture_writer
 from mapp_env.commands.policies import (
+    ENVIRONMENT,
     add_policy_options,
     environment_of,
     play_policy,
@@ -32,7 +37,8 @@ from mapp_env.commands.policies import (
 )
 from mapp_env.plans.plan import OBJECTIVES, Plan, replay
 from mapp_env.problem import Problem
-from mapp_env.solvers import solve
+from mapp_env.solvers import regrets, solve
+from mapp_env.solvers.oracle.decisions import MAX_REGRET_LANDMARKS
 from mapp_env.validation import check_count
 
 STEPS = 50
@@ -65,6 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--fps", type=float, metavar="F", help=f"frames a second of a GIF (default {DEFAULT_FPS:g})"
     )
+    add(
+        "--show-regret",
+        action="store_true",
+        help="mark what the agents did in steps after which even the optimum is longer than it "
+        f"was; up to {MAX_REGRET_LANDMARKS} landmarks",
+    )
     reports.add_json_option(parser)
     problem_options.add_problem_options(parser)
 
@@ -77,14 +89,29 @@ def run(arguments: argparse.Namespace) -> None:
     """
     draw = picture_writer("--out", arguments.out, arguments.fps)
     problem, plan = _plan_of(arguments)
-    size = draw(problem, plan)
+    lost = _regrets_of(problem, plan) if arguments.show_regret else None
+    size = draw(problem, plan, lost)
     record = {"out": arguments.out, "bytes": size, "landmarks": list(problem.landmarks)}
     if problem.starts is not None:
         record["starts"] = list(problem.starts)
     wrote = f"wrote {arguments.out}: {size} bytes"
     lines = [wrote, reports.costs_line(problem, plan), reports.landmarks_line(problem)]
     lines += reports.starts_lines(problem)
+    if lost is not None:
+        record["regrets"] = lost.tolist()
+        steps = (f"{step + 1} ({lost[step]})" for step in np.flatnonzero(lost))
+        lines.append(f"{lost.sum()} steps lost, by step: {', '.join(steps) or 'none'}")
     reports.print_report(arguments, {**record, **reports.costs_record(plan)}, lines)
+
+
+def _regrets_of(problem: Problem, plan: Plan) -> NDArray[np.int64]:
+    """Return what each step of a plan lost."""
+    count = len(problem.landmarks)
+    if count > MAX_REGRET_LANDMARKS:
+        raise ValueError(
+            f"--show-regret is for up to {MAX_REGRET_LANDMARKS} landmarks, here are {count}"
+        )
+    return regrets(problem, plan.actions)
 
 
 def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
@@ -96,7 +123,7 @@ def _plan_of(arguments: argparse.Namespace) -> tuple[Problem, Plan]:
         raise ValueError("--objective is for --plan optimum")
     if arguments.max_cycles is not None and source not in ("random", "policy"):
         raise ValueError("--max-cycles is for --plan random and --policy")
-    for name in ("policy_loader", "observation"):
+    for name in ("policy_loader", *ENVIRONMENT):
         if getattr(arguments, name) is not None and source != "policy":
             raise ValueError(f"--{name.replace('_', '-')} is for --policy")
     if source not in ("optimum", "random", "policy"):

@@ -96,7 +96,7 @@ def step_row(
     state = split_row(row, world.n_agents, world.n_landmarks)
     move_row(state, actions, world)
     reward, terminated = visit_row(state, world)
-    return reward, terminated, not terminated and state.step[0] >= max_cycles
+    return reward, terminated, bool(not terminated and state.step[0] >= max_cycles)
 
 
 @kernel

@@ -33,6 +33,8 @@ class Scene:
         Steps since the reset.
     max_cycles : int
         The step at which the episode is truncated.
+    lost : tuple of int, optional
+        The regret of each step so far, in steps; without it, nothing is shown of it.
     """
 
     grid: Grid
@@ -42,3 +44,4 @@ class Scene:
     trails: tuple[tuple[int, ...], ...]
     step: int
     max_cycles: int
+    lost: tuple[int, ...] | None = None

@@ -87,10 +87,11 @@ def evaluate(
         - ``steps`` (int): decisions until the end;
         - ``regret``: steps lost a decision, the mean over an episode: the regret of a decision is
           the least cover time (with ``return_home``, the least makespan) from after it, plus 1,
-          less that from before it. NaN for other objectives, and beyond 12 landmarks;
+          less that from before it. NaN for other objectives, without an optimum, or if the episode
+          ended with more than 12 landmarks left;
         - ``lost_first``, ``lost_middle``, ``lost_last``: steps lost in all by the first decision;
           by later ones, while more than one landmark was left; by those with one left, or none.
-          They add up to cost - optimum where the problem was solved.
+          They add up to cost - optimum where the problem was solved. NaN beyond 12 landmarks.
 
     Raises
     ------
@@ -150,9 +151,9 @@ def evaluate(
             "steps": episodes.steps,
         }
         if objective == counted:
-            losses = find_losses(group, episodes.moments, optimum, home)
-            values["regret"] = losses.sum(axis=0) / episodes.steps
-            values |= dict(zip(LOSSES, losses, strict=True))
+            losses = find_losses(group, episodes.moments, proven, home)
+            values["regret"] = losses[0] / episodes.steps
+            values |= dict(zip(LOSSES, losses[1:], strict=True))
         for name, value in values.items():
             found[name][group.places] = value
     bar.close()

@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 from mapp_env.evaluation.episodes import Moments
 from mapp_env.evaluation.problems import Group
 from mapp_env.evaluation.progress import Progress
-from mapp_env.solvers import optimal_costs, solve
-from mapp_env.solvers.batch import MAX_BATCH_LANDMARKS
+from mapp_env.solvers import optimal_costs
 from mapp_env.solvers.bounds import lower_bound
-from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS
+from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
+from mapp_env.solvers.oracle.states import MAX_BATCH_LANDMARKS
 from mapp_env.solvers.solution import problem_distances
-
-MAX_REGRET_LANDMARKS = MAX_BATCH_LANDMARKS
-"""Most landmarks for which the cost that is left is looked up in the middle of an episode."""
 
 
 class Proven(NamedTuple):
@@ -49,7 +46,7 @@ def proven_costs(
         for row in range(n_problems):
             problem = group.problem(row)
             if n_landmarks <= MAX_EXACT_LANDMARKS:
-                optimum[row] = bound[row] = solve(problem, objective, "exact").cost
+                optimum[row] = bound[row] = solve_exact(problem, objective).bound
             else:
                 bound[row] = lower_bound(problem, objective, problem_distances(problem))
             if progress is not None:
@@ -97,17 +94,19 @@ def costs_to_go(
 ) -> NDArray[np.float64]:
     """Return the least cost, (P,), of visiting what is left from where the agents are.
 
-    Up to 12 landmarks may be left of each problem; ``home`` as in :func:`proven_costs`.
+    NaN where more than 12 landmarks are left; ``home`` is as in :func:`proven_costs`.
     """
     costs, counts = np.zeros(len(left)), left.sum(axis=1)
     for number, grid in enumerate(group.grids):
         for count in np.unique(counts[group.which == number]).tolist():
             rows = np.flatnonzero((group.which == number) & (counts == count))
-            if count > 0:
+            if count > MAX_BATCH_LANDMARKS:
+                costs[rows] = np.nan
+            elif count > 0:
                 landmarks = group.landmarks[rows][left[rows]].reshape(-1, count)
                 starts = cells[rows]
-                given = {} if (starts == grid.depot).all() else {"starts": starts}
-                costs[rows] = optimal_costs(grid, landmarks, group.n_agents, objective, **given)
+                given = None if (starts == grid.depot).all() else starts
+                costs[rows] = optimal_costs(grid, landmarks, group.n_agents, objective, given)
     return _with_ways_home(group, cells, costs, objective, home)
 
 
@@ -130,20 +129,18 @@ def _with_ways_home(
 def find_losses(
     group: Group, moments: Moments, optimum: NDArray[np.float64], home: bool = False
 ) -> NDArray[np.float64]:
-    """Return what decisions have lost, in steps, where: (3, P).
+    """Return how many steps decisions have lost, in all and by where: (4, P).
 
     A decision's regret is the step it took, and the least cost from after it, less that from before
-    it. Summed up: of the first decision; of those after it as long as more than one landmark is
+    it. Summed up: of all; of the first; of those after it as long as more than one landmark is
     left; of those with one left, or none. The cost is the cover time, or, if all walk ``home``, the
-    makespan. The three together are the cost less the ``optimum``, (P,); an episode that ended
-    unsolved costs what it took and would have taken on at least. NaN beyond 12 landmarks.
+    makespan. The sum of all is the cost less the ``optimum``, (P,); an episode that ended unsolved
+    costs what it took and would have taken on at least. NaN where the middle of an episode, with
+    more than 12 landmarks left, would have to be solved.
     """
-    if group.landmarks.shape[1] > MAX_REGRET_LANDMARKS:
-        return np.full(moments.steps.shape, np.nan)
     ahead = [
         costs_to_go(group, cells, left, "makespan" if home else "cover_time", home)
         for cells, left in zip(moments.cells, moments.left, strict=True)
     ]
-    total = np.vstack([optimum, moments.steps + ahead])
-    losses: NDArray[np.float64] = np.diff(total, axis=0)
-    return losses
+    costs = np.vstack([optimum, moments.steps + ahead])
+    return np.vstack([costs[-1] - costs[0], np.diff(costs, axis=0)])

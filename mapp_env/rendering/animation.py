@@ -6,6 +6,7 @@ import io
 import os
 import zlib
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from mapp_env.files import check_writable, write_bytes
 from mapp_env.plans.plan import replay
 from mapp_env.problem import Problem
 from mapp_env.rendering.rgb_array import Frame, rgb_array
-from mapp_env.validation import check_count, check_flag, check_number, describe
+from mapp_env.validation import as_array, check_count, check_flag, check_number, describe
 
 MAX_FRAMES = 2_000
 MAX_PIXELS = 1 << 28  # of all frames together: 960 of the default grid; they are kept in memory
@@ -36,6 +37,7 @@ def save_animation(
     hold: float = 2.0,
     loop: bool = True,
     max_side: int = 640,
+    regrets: ArrayLike | None = None,
 ) -> int:
     """Play joint actions by the rules and write the episode as an animated GIF.
 
@@ -60,6 +62,9 @@ def save_animation(
     max_side : int
         Pixels that the longer side of the grid may take, 16 to 1024 (the environment's own); cells
         are made smaller for it, but not larger than 72 pixels.
+    regrets : array_like of int, shape (T,), optional
+        Steps lost by each joint action, as :func:`~mapp_env.solvers.regrets` gives them: the moves
+        of those that lost some are marked, and the sum is shown.
 
     Returns
     -------
@@ -74,7 +79,8 @@ def save_animation(
     """
     side = check_count("max_side", max_side, 16, 1024)
     actions = replay(problem, joint_actions).actions
-    frames = (rgb_array(scene, side) for scene in scenes(problem, actions))
+    lost = None if regrets is None else check_regrets(regrets, len(actions))
+    frames = (rgb_array(scene, side) for scene in scenes(problem, actions, lost))
     return _save(path, frames, fps, hold, loop, len(actions) + 1)
 
 
@@ -130,8 +136,20 @@ def _save(
     return len(data)
 
 
-def scenes(problem: Problem, actions: tuple[tuple[int, ...], ...]) -> Iterator[Scene]:
-    """Yield what the environment would show of an episode."""
+def check_regrets(regrets: object, n_steps: int) -> tuple[int, ...]:
+    """Return the regret of each step; raise a ValueError if they are not so many whole numbers."""
+    array = as_array(regrets)
+    if array.shape != (n_steps,) or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"regrets must be integers, one for each of {n_steps} steps, got {describe(regrets)}"
+        )
+    return tuple(array.tolist())
+
+
+def scenes(
+    problem: Problem, actions: tuple[tuple[int, ...], ...], lost: tuple[int, ...] | None = None
+) -> Iterator[Scene]:
+    """Yield what the environment would show of an episode, and of the regrets of its steps."""
     limit = problem.max_cycles if problem.max_cycles is not None else max(len(actions), 1)
     task = Task(
         problem.grid,
@@ -145,10 +163,10 @@ def scenes(problem: Problem, actions: tuple[tuple[int, ...], ...]) -> Iterator[S
     simulation = Simulation(task, 1)
     asked = simulation.check_options({"problem": problem})
     simulation.reset(asked, np.random.default_rng(0))
-    yield simulation.scene()
-    for joint_action in actions:
-        simulation.step(np.array(joint_action, np.int64))
-        yield simulation.scene()
+    for step in range(len(actions) + 1):
+        if step > 0:
+            simulation.step(np.array(actions[step - 1], np.int64))
+        yield replace(simulation.scene(), lost=None if lost is None else lost[:step])
 
 
 def _checked(frames: Iterable[Frame], n_frames: int | None) -> Iterator[Frame]:

@@ -14,12 +14,14 @@ from matplotlib.patches import Patch
 
 from mapp_env.files import FileError, check_writable, write_bytes
 from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.rendering.animation import check_regrets
 from mapp_env.rendering.ground import NOT_VISITED, Signs, draw_ground
-from mapp_env.rendering.palette import INK, WALL, agent_colour, to_hex
-from mapp_env.rendering.routes import DASHES, draw_routes
+from mapp_env.rendering.palette import INK, LOST, WALL, agent_colour, to_hex
+from mapp_env.rendering.routes import DASHES, draw_lost_moves, draw_routes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
 
     from mapp_env.grid import Grid
     from mapp_env.plans.plan import Plan
@@ -35,7 +37,11 @@ LEGEND_COLUMNS = 3
 
 
 def draw_plan(
-    problem: Problem, plan: Plan, ax: Axes | None = None, title: str | None = None
+    problem: Problem,
+    plan: Plan,
+    ax: Axes | None = None,
+    title: str | None = None,
+    regrets: ArrayLike | None = None,
 ) -> Axes:
     """Draw the tours of a plan.
 
@@ -55,15 +61,25 @@ def draw_plan(
         Where to draw; by default a new figure, unknown to pyplot, that ``ax.figure`` gives.
     title : str, optional
         By default the plan's costs; an empty string for none.
+    regrets : array_like of int, shape (T,), optional
+        Steps lost by each of ``plan.actions``, as :func:`~mapp_env.solvers.regrets` gives them:
+        what the agents did in those that lost some is marked, also where no tour leads.
 
     Returns
     -------
     matplotlib.axes.Axes
         Where it was drawn.
+
+    Raises
+    ------
+    ValueError
+        If there is not one regret for each step.
     """
     grid = problem.grid
+    lost = None if regrets is None else check_regrets(regrets, len(plan.actions))
     if ax is None:
-        panel = Panel(grid, len(plan.tours))
+        more = 0 if lost is None else LEGEND_COLUMNS
+        panel = Panel(grid, len(plan.tours) + more)
         ax = panel.add_axes(Figure(figsize=panel.size, dpi=DPI))
     _prepare(ax, grid)
     points = _points_per_cell(ax, grid)
@@ -72,6 +88,8 @@ def draw_plan(
     signs = Signs(ax, grid, points)
     signs.tint([grid.depot], of_depot=True)
     signs.tint(problem.landmarks)
+    if lost is not None:
+        draw_lost_moves(ax, problem, plan, lost, points)
     draw_routes(ax, grid, plan, points)
     signs.house(grid.depot)
     for start in sorted(set(problem.start_cells) - {grid.depot}):
@@ -80,7 +98,7 @@ def draw_plan(
         if cell not in claimed:
             signs.frame(cell)
         signs.flag(cell)
-    _draw_legend(ax, plan, len(claimed) < len(problem.landmarks))
+    _draw_legend(ax, plan, len(claimed) < len(problem.landmarks), lost)
     title = costs_of(plan) if title is None else title
     if title:
         ax.set_title(title, fontsize=11, color=to_hex(INK))
@@ -177,7 +195,9 @@ def _points_per_cell(ax: Axes, grid: Grid) -> float:
     return max(float(pixels) * 72 / ax.figure.dpi, 0.1)
 
 
-def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
+def _draw_legend(
+    ax: Axes, plan: Plan, some_unvisited: bool, lost: tuple[int, ...] | None = None
+) -> None:
     entries: list[Line2D | Patch] = []
     for agent, tour in enumerate(plan.tours):
         colour = to_hex(agent_colour(agent))
@@ -195,6 +215,9 @@ def _draw_legend(ax: Axes, plan: Plan, some_unvisited: bool) -> None:
     entries.append(Line2D([], [], color=ink, linewidth=1.6, label="to the last landmark"))
     entries.append(Line2D([], [], color=ink, linewidth=1.6, linestyle=DASHES, label="way home"))
     entries.append(Patch(label="not visited", **NOT_VISITED) if some_unvisited else nothing)
+    if lost is not None:
+        label = f"{sum(step > 0 for step in lost)} decisions lost {sum(lost)} steps"
+        entries += [Line2D([], [], color=to_hex(LOST), linewidth=8, label=label), nothing, nothing]
     # Matplotlib fills column by column; people read row by row.
     by_column = [entry for col in range(LEGEND_COLUMNS) for entry in entries[col::LEGEND_COLUMNS]]
     ax.legend(

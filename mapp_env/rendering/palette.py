@@ -20,6 +20,7 @@ FLAG_CELL: Colour = (252, 224, 225)
 FLAG_VISITED: Colour = (150, 168, 155)
 FLAG_VISITED_CELL: Colour = (228, 238, 229)
 CHECK: Colour = (30, 122, 70)
+LOST: Colour = (255, 221, 72)  # as of a marker pen: moves of a step that lost something
 
 # The first five are from Okabe and Ito's colour-blind-safe set, without the vermilion, which looks
 # like a flag. The others were searched for: the smallest Oklab distance between any two agents is

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -56,14 +57,36 @@ def rgb_array(scene: Scene, max_side: int = MAX_SIDE) -> Frame:
     ndarray of uint8, shape (height, width, 3)
         A fresh array; height and width are even, as video encoders want.
     """
-    layout = _layout(*scene.grid.walls.shape, len(scene.landmarks), scene.max_cycles, max_side)
+    told = scene.lost is not None
+    sizes = len(scene.landmarks), scene.max_cycles, max_side
+    layout = _layout(*scene.grid.walls.shape, *sizes, told)
     frame = _background(scene.grid, layout).copy()
     _draw_flag_cells(frame, layout, scene)
+    _draw_lost_moves(frame, layout, scene)
     _draw_trails(frame, layout, scene)
     _draw_depot_and_flags(frame, layout, scene)
     _draw_agents(frame, layout, scene)
     _draw_status(frame, layout, scene)
     return frame
+
+
+def pad_frames(frames: Sequence[Frame], scenes: Iterable[tuple[int, int, int, int]]) -> list[Frame]:
+    """Return frames, each at the top left of a sheet of the size that all of them fit on.
+
+    So do the frames of ``scenes`` to come: rows, columns, number of landmarks and step limit of
+    each. Videos need frames of one size, also where each episode is on another grid.
+    """
+    sides = [frame.shape[:2] for frame in frames]
+    for scene in scenes:
+        layout = _layout(*scene, MAX_SIDE)
+        sides.append((layout.height + BAR, layout.width))
+    sheet = np.empty((*np.max(sides, axis=0), 3), np.uint8)
+    sheet[:] = palette.PAPER
+    padded = []
+    for frame in frames:
+        padded.append(sheet.copy())
+        padded[-1][: frame.shape[0], : frame.shape[1]] = frame
+    return padded
 
 
 @dataclass(frozen=True)
@@ -115,12 +138,16 @@ class _Layout:
 
 
 @lru_cache(maxsize=64)
-def _layout(rows: int, cols: int, n_landmarks: int, max_cycles: int, max_side: int) -> _Layout:
+def _layout(
+    rows: int, cols: int, n_landmarks: int, max_cycles: int, max_side: int, told: bool
+) -> _Layout:
     longer = max(rows, cols)
     cell = max(min(MAX_CELL, max_side // longer), 1)
     merged = math.ceil(longer / max_side) if longer > MAX_SIDE else 1
     # The widest texts that the bar will ever show in this episode.
     texts = _status_texts(max_cycles, max_cycles, n_landmarks, n_landmarks)
+    if told:
+        texts += (f" {_lost_text(max_cycles)} ",)
     bar_width = sum(icons.text(part, TEXT, palette.PAPER).shape[1] for part in texts) + 2 * BAR
     across, down = (math.ceil(side / merged) * cell for side in (cols, rows))
     width = max(across + 2 * MARGIN, bar_width, MIN_AREA[0])
@@ -178,6 +205,20 @@ def _draw_depot_and_flags(frame: Frame, layout: _Layout, scene: Scene) -> None:
     for visited, cell in sorted(zip(scene.visited, scene.landmarks, strict=True), reverse=True):
         flag = icons.flag(layout.icon, bool(visited), plate)
         paste(frame, flag, *layout.inside(cell, layout.icon))
+
+
+def _draw_lost_moves(frame: Frame, layout: _Layout, scene: Scene) -> None:
+    """Mark the moves, as far back as trails go, of steps that lost something."""
+    half = max(round(0.2 * layout.cell), 2)
+    for trail in scene.trails:
+        corners = [layout.centre(cell) for cell in trail]
+        # A trail need not go back to the start.
+        latest = (scene.lost or ())[::-1]
+        for lost, (end, start) in zip(latest, pairwise(corners[::-1]), strict=False):
+            if lost > 0:
+                top, bottom = sorted((int(start[0]), int(end[0])))
+                left, right = sorted((int(start[1]), int(end[1])))
+                frame[top - half : bottom + half, left - half : right + half] = palette.LOST
 
 
 def _draw_trails(frame: Frame, layout: _Layout, scene: Scene) -> None:
@@ -266,8 +307,12 @@ def _overlap(place: _Place, other: _Place) -> bool:
     return abs(place[0] - other[0]) < apart and abs(place[1] - other[1]) < apart
 
 
-def _status_texts(step: int, max_cycles: int, n_visited: int, n_landmarks: int) -> tuple[str, str]:
+def _status_texts(step: int, max_cycles: int, n_visited: int, n_landmarks: int) -> tuple[str, ...]:
     return f"step {step} / {max_cycles}", f"landmarks {n_visited} / {n_landmarks}"
+
+
+def _lost_text(lost: int) -> str:
+    return f"steps lost {lost}"
 
 
 def _draw_status(frame: Frame, layout: _Layout, scene: Scene) -> None:
@@ -279,6 +324,9 @@ def _draw_status(frame: Frame, layout: _Layout, scene: Scene) -> None:
     done = blend(palette.CHECK, palette.PAPER, 0.55)
     icon = icons.text(right, TEXT, done if n_visited == n_landmarks else palette.PAPER)
     paste(frame, icon, middle, layout.width - BAR / 2 - icon.shape[1] / 2)
+    if scene.lost is not None:
+        icon = icons.text(_lost_text(sum(scene.lost)), TEXT, palette.LOST)
+        paste(frame, icon, middle, layout.width / 2)
     # A thin line above the texts that fills up with the steps.
     share = min(scene.step / max(scene.max_cycles, 1), 1.0)
     line = frame[layout.height : layout.height + 3]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -11,14 +12,16 @@ from typing import TYPE_CHECKING
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
+from mapp_env.engine.state import WAIT
 from mapp_env.rendering.ground import Point, middle_of
-from mapp_env.rendering.palette import FLOOR, agent_colour, blend, to_hex
+from mapp_env.rendering.palette import FLOOR, LOST, agent_colour, blend, to_hex
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mapp_env.grid import Grid
     from mapp_env.plans.plan import Plan
+    from mapp_env.problem import Problem
 
 ARROWS_APART = 20.0  # points, at least
 LEAST_WIDTH, MOST_WIDTH = 0.9, 2.4  # points, of a line
@@ -26,6 +29,7 @@ LANES = 0.42  # cells, from the middle of a corridor to where the outermost lane
 LANE = 0.13  # cells, of a lane where there is room for more
 LEAST_LANE = 2.4  # points, of a lane if there is room for it
 HOME_PALER = 0.3
+MARKER = 0.4  # cells, the width of a mark
 DASHES = (0, (2.4, 1.8))
 
 
@@ -52,6 +56,29 @@ def draw_routes(ax: Axes, grid: Grid, plan: Plan, points: float) -> None:
         route = _Route(agent, lanes[agent], middles, corners, leaves, turn)
         _draw_line(ax, route, width)
         _draw_arrows(ax, route, width, points)
+
+
+def draw_lost_moves(
+    ax: Axes, problem: Problem, plan: Plan, regrets: Sequence[int], points: float
+) -> None:
+    """Mark what all agents did in the steps that lost something, as with a marker pen."""
+    grid = problem.grid
+    at = list(problem.start_cells)
+    for joint_action, lost in zip(plan.actions, regrets, strict=True):
+        for agent, action in enumerate(joint_action):
+            cell = at[agent]
+            if action != WAIT:
+                at[agent] = int(grid.moves[cell, action])
+            if lost > 0:
+                (across, down), end = middle_of(grid, cell), middle_of(grid, at[agent])
+                ax.plot(
+                    [across, end[0] + 1e-6],  # a line of no length is not drawn
+                    [down, end[1]],
+                    color=to_hex(LOST),
+                    linewidth=MARKER * points,
+                    solid_capstyle="round",
+                    zorder=3,
+                )
 
 
 def _lanes(tours: tuple[tuple[int, ...], ...]) -> list[int]:

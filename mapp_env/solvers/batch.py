@@ -13,13 +13,18 @@ from mapp_env.grid import FAR, MAX_ALL_PAIRS_CELLS, Grid
 from mapp_env.plans.plan import OBJECTIVES
 from mapp_env.problem import MAX_AGENTS, check_grid
 from mapp_env.solvers.held_karp import Steps, route_costs, shortest_routes
+from mapp_env.solvers.oracle.states import (
+    CHUNK_WORK,
+    MAX_BATCH_LANDMARKS,
+    Room,
+    fill_optima,
+    list_states,
+)
 from mapp_env.solvers.solution import cell_distances, team_of
 from mapp_env.validation import as_array, check_choice, check_count, describe
 
-MAX_BATCH_LANDMARKS = 12  # of each problem
 MAX_UNIVERSE_PROBLEMS = 10_000_000  # of a grid: up to half a gigabyte of answers
 MAX_UNIVERSE_WORK = 20_000_000_000  # of them times 3 ** n_landmarks: some minutes
-CHUNK_WORK = 4_000_000  # between two chances to interrupt: some milliseconds
 
 
 class Workspace(NamedTuple):
@@ -39,7 +44,11 @@ class Workspace(NamedTuple):
 
 
 def optimal_costs(
-    grid: Grid, landmarks: object, n_agents: int = 3, objective: str = "cover_time"
+    grid: Grid,
+    landmarks: object,
+    n_agents: int = 3,
+    objective: str = "cover_time",
+    starts: object = None,
 ) -> NDArray[np.int32]:
     """Return the proven optimum of many problems of one grid.
 
@@ -56,6 +65,9 @@ def optimal_costs(
         1 to 16.
     objective : {"cover_time", "makespan", "total_distance"}
         What is minimised.
+    starts : array_like of int, shape (P, N), optional
+        Where each problem's agents stand at first, cells as of ``Problem(starts=...)``; without it
+        all start on the depot, which is faster.
 
     Returns
     -------
@@ -72,6 +84,12 @@ def optimal_costs(
     cells = _check_rows(grid, landmarks)
     n_problems, n_landmarks = cells.shape
     optimum = np.empty(n_problems, np.int32)
+    if starts is not None:
+        agents = _check_starts(grid, starts, n_agents, cells)
+        room = Room.of(n_agents, n_landmarks)
+        for some, states in list_states(grid, cells, agents, objective != "cover_time"):
+            fill_optima(states, objective == "total_distance", room, optimum[some])
+        return optimum
     teams, closed = team_of(objective, n_agents, n_landmarks)
     workspace = Workspace.of(n_landmarks)
     chunk = max(1, CHUNK_WORK // 3**n_landmarks)
@@ -186,6 +204,29 @@ def _check_rows(grid: Grid, landmarks: object) -> NDArray[np.int64]:
         raise ValueError(
             f"landmarks[{row}] must be distinct cells reachable from the depot, and not the depot, "
             f"got {rows[row].tolist()}"
+        )
+    return rows.astype(np.int64)
+
+
+def _check_starts(
+    grid: Grid, starts: object, n_agents: int, landmarks: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return starts as cells (P, N), on which each row's agents may begin."""
+    shape = (len(landmarks), n_agents)
+    rows = as_array(starts)
+    if rows.shape != shape or rows.dtype.kind not in "iu":
+        raise ValueError(
+            f"starts must be integers of shape {shape}, a row for each of landmarks, got "
+            f"{describe(starts) if rows.ndim == 0 else f'{rows.dtype} of shape {rows.shape}'}"
+        )
+    inside = (rows >= 0) & (rows < grid.n_cells)
+    bad = ~inside | (grid.home[np.where(inside, rows, 0)] < 0)
+    bad |= (rows[:, :, None] == landmarks[:, None, :]).any(axis=2)
+    if bad.any():
+        row = int(bad.any(axis=1).argmax())
+        raise ValueError(
+            f"starts[{row}] must be cells reachable from the depot, none of them a landmark of the "
+            f"row, got {rows[row].tolist()}"
         )
     return rows.astype(np.int64)
 

@@ -12,11 +12,11 @@ import torch
 from baselines import distill, independent_dqn, meta_dqn, self_improve
 from baselines.learning import train
 from baselines.learning.config import parse_options
-from baselines.learning.exact_values import steps_left
 from baselines.policies.evaluation import Setting, evaluate, find_optima, unseen_problems
 from baselines.policies.policy import load_policy
 from mapp_env import Grid, make_grid, sample_problems
 from mapp_env.solvers import optimal_costs
+from mapp_env.solvers.oracle.decisions import action_costs
 
 SMALL = {
     "n_agents": 2,
@@ -28,11 +28,6 @@ SMALL = {
     "batch_size": 64,
     "evaluation_problems": 0,
 }
-
-
-def tables(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return moves and distances as the labels want them."""
-    return np.asarray(grid.moves)[:, :4].astype(np.int64), np.asarray(grid.distances, np.int64)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +43,7 @@ def test_labels_at_the_depot_are_the_optimum(grid, n_agents, n_landmarks):
     """One step and the best that is left after it are the proven optimum of the problem."""
     landmarks = sample_problems(grid, 200, n_landmarks).astype(np.int64)
     cells = np.full((200, n_agents), grid.depot)
-    steps = steps_left(cells, landmarks, np.zeros(landmarks.shape, bool), *tables(grid))
+    steps = action_costs(grid, landmarks, np.ones(landmarks.shape, bool), cells, grid.moves)
     optimum = optimal_costs(grid, landmarks, n_agents)
     np.testing.assert_array_equal(steps.min(axis=1) + 1, optimum)
 
@@ -57,18 +52,17 @@ def test_labels_at_the_depot_are_the_optimum(grid, n_agents, n_landmarks):
 def test_labels_are_consistent_along_any_walk(n_agents, n_landmarks):
     """What is left after an action is one step more than what is left after the best next one."""
     grid = make_grid("random", rows=6, cols=7, seed=4, density=0.25)
-    moves, distances = tables(grid)
     rng = np.random.default_rng(n_agents)
     anywhere = np.append(grid.reachable, grid.depot)
     cells = rng.choice(anywhere, (40, n_agents))
     landmarks = sample_problems(grid, 40, n_landmarks).astype(np.int64)
     visited = (landmarks[:, :, None] == cells[:, None]).any(2) | (rng.random(landmarks.shape) < 0.3)
-    steps = steps_left(cells, landmarks, visited, moves, distances)
+    steps = action_costs(grid, landmarks, ~visited, cells, grid.moves)
     for joint in range(4**n_agents):
         actions = np.array(np.unravel_index(joint, (4,) * n_agents))
-        following = moves[cells, actions]
+        following = grid.moves[cells, actions]
         after = visited | (landmarks[:, :, None] == following[:, None]).any(2)
-        left = steps_left(following, landmarks, after, moves, distances).min(axis=1) + 1
+        left = action_costs(grid, landmarks, ~after, following, grid.moves).min(axis=1) + 1
         np.testing.assert_array_equal(steps[:, joint], np.where(after.all(axis=1), 0, left))
 
 
@@ -76,11 +70,11 @@ def test_wrong_answers_are_asked_again_until_they_are_right():
     """Just the states whose greedy action is not optimal wait, the oldest first, and come next."""
     args = distill.Args(**{**SMALL, "asked_again": 5})
     distilled = distill.Distilled(args, make_grid())
-    tables_of = tables(make_grid())
+    grid = make_grid()
 
     def wrong(obs: np.ndarray) -> np.ndarray:
         cells, landmarks, flags = np.split(obs.astype(np.int64), (2, 4), axis=1)
-        steps = steps_left(cells, landmarks, flags > 0, *tables_of)
+        steps = action_costs(grid, landmarks, flags == 0, cells, grid.moves)
         with torch.inference_mode():
             best = distilled.network(torch.from_numpy(obs)).argmax(1).numpy()
         return steps[np.arange(len(obs)), best] > steps.min(axis=1)
