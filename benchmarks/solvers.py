@@ -4,10 +4,12 @@ Landmarks are drawn at random on `paper-7x7` and on generated grids. "best known
 optimum where the exact solver can handle the problem, otherwise the best of all methods and of a
 search with another seed for three times as long; "proven" means that the cost meets a lower bound,
 which ends a search early. One thread; times include computing the distances between landmarks, and
-vary with the machine.
+vary with the machine. Then, for agents that start apart, how long it takes to look up the cost of
+every decision, and to prove an optimum.
 
     python benchmarks/solvers.py            # five minutes; quick: --seconds 0.2 --instances 1
     python benchmarks/solvers.py --grid rooms --objective makespan
+    python benchmarks/solvers.py --many 1000    # solve_many on so many problems
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import argparse
 import importlib.util
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from statistics import mean, median
 from typing import NamedTuple
 
@@ -28,6 +31,7 @@ import numpy as np
 
 from mapp_env import Problem, make_grid
 from mapp_env.plans.plan import OBJECTIVES
+from mapp_env.solvers import next_costs, next_costs_of, optimal_costs, solve_many
 from mapp_env.solvers.earliest_arrival import assign_landmarks
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.pyvrp import solve_pyvrp
@@ -143,14 +147,109 @@ def compare(problems: Sequence[Problem], objective: str, seconds: float) -> list
     return lines
 
 
+# Landmarks, agents and states of a batch, whose costs are looked up; and how long that should take.
+DECISIONS = ((5, 3, 10_000, 10.0), (8, 3, 2_000, None), (10, 3, 500, 400.0), (12, 3, 50, None))
+APART = ((16, 5), (16, 16), (18, 5), (18, 16), (20, 5), (20, 16))  # landmarks, agents
+
+
+def draw_starts(kind: str, side: int, n_landmarks: int, n_agents: int, seed: int) -> Problem:
+    """Return the problem for a seed, each agent on a cell of its own."""
+    problem = draw_problem(kind, side, n_landmarks, n_agents, seed)
+    others = np.setdiff1d(problem.grid.reachable, problem.landmarks)
+    starts = np.random.default_rng(seed).choice(others, n_agents, replace=False).tolist()
+    return Problem(problem.grid, problem.landmarks, n_agents, starts=starts)
+
+
+def time_decisions(kind: str) -> None:
+    """Print what each choice of a next landmark costs to look up, for states of a batch."""
+    print("\nlandmarks / agents |  us a state | at most | us from problems | us the optimum alone")
+    print("|".join("-" * width for width in (19, 13, 9, 18, 22)))
+    for n_landmarks, n_agents, n_states, most in DECISIONS:
+        grid = draw_problem(kind, 16, n_landmarks, n_agents, 0).grid
+        rng = np.random.default_rng(1)
+        drawn = [
+            rng.choice(grid.reachable, n_landmarks + n_agents, replace=False).tolist()
+            for _ in range(n_states)
+        ]
+        problems = [
+            Problem(grid, cells[:n_landmarks], n_agents, starts=cells[n_landmarks:])
+            for cells in drawn
+        ]
+        ends, stands = np.hsplit(np.array(drawn), [n_landmarks])
+        between = grid.distances[ends[:, :, None], ends[:, None]]
+        starts = grid.distances[stands[:, :, None], ends[:, None]]
+        seconds = [
+            time_best(partial(next_costs_of, between, starts)),
+            time_best(partial(next_costs, problems)),
+            time_best(partial(optimal_costs, grid, ends, n_agents, starts=stands)),
+        ]
+        each, whole, alone = (1e6 * one / n_states for one in seconds)
+        limit = "" if most is None else f"{most:g}"
+        print(
+            f"{n_landmarks:>9} / {n_agents:<6} | {each:11.2f} | {limit:>7} | {whole:16.2f} "
+            f"| {alone:20.2f}",
+            flush=True,
+        )
+
+
+def time_best(call: Callable[[], object], times: int = 3) -> float:
+    """Return the seconds of the fastest of some calls, of this thread alone."""
+    seconds = []
+    for _ in range(times + 1):  # the first compiles
+        start = time.thread_time()
+        call()
+        seconds.append(time.thread_time() - start)
+    return min(seconds[1:])
+
+
+def time_apart(kind: str, instances: int) -> None:
+    """Print how long the exact solver takes for agents that all start apart."""
+    print("\n32x32, agents apart | objective      | exact: ms, median | longest")
+    print("|".join("-" * width for width in (20, 16, 19, 9)))
+    for n_landmarks, n_agents in APART:
+        for objective in OBJECTIVES:
+            seconds = []
+            for seed in range(instances):
+                problem = draw_starts(kind, 32, n_landmarks, n_agents, seed)
+                start = time.thread_time()
+                solve_exact(problem, objective)
+                seconds.append(time.thread_time() - start)
+            print(
+                f"{n_landmarks:>9} / {n_agents:<7} | {objective:<14} "
+                f"| {1000 * median(seconds):17.0f} | {1000 * max(seconds):7.0f}",
+                flush=True,
+            )
+
+
+def measure_many(count: int, kind: str) -> None:
+    """Print what `solve_many` takes for each of many problems, each on a map of its own."""
+    problems = [draw_problem(kind, 32, 20, 5, seed) for seed in range(count)]
+    solve_many(problems[:20])  # compile and load kernels
+    print(f"{count} problems of 32x32 / 20 / 5 on {kind} grids, cover time\n")
+    print("solve_many with        | ms each, in all | mean cost | of these proven")
+    print("|".join("-" * width for width in (23, 17, 11, 16)))
+    for options in ({"time_limit": 0.001}, {"iterations": 500}, {"time_limit": 0.02}):
+        start = time.perf_counter()
+        plans = solve_many(problems, **options)
+        each = 1000 * (time.perf_counter() - start) / count
+        name = ", ".join(f"{option}={value}" for option, value in options.items())
+        proven = sum(plan.status == "optimal" for plan in plans)
+        cost = mean(plan.cost for plan in plans)
+        print(f"{name:<22} | {each:15.2f} | {cost:9.2f} | {proven:4d}/{count}", flush=True)
+
+
 def main() -> None:
-    """Print the table."""
+    """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=1.0, help="seconds per search")
     parser.add_argument("--instances", type=int, default=3, help="problems per size")
     parser.add_argument("--grid", default="random", help="generator of the larger grids")
     parser.add_argument("--objective", choices=OBJECTIVES, help="only this one")
+    parser.add_argument("--many", type=int, metavar="P", help="only solve_many, on P problems")
     args = parser.parse_args()
+    if args.many is not None:
+        measure_many(args.many, args.grid)
+        return
     # Compile and load kernels before timing.
     for objective in OBJECTIVES:
         compare([draw_problem(args.grid, 7, 3, 2, 0)], objective, 0.01)
@@ -176,6 +275,8 @@ def main() -> None:
                 continue
             for line in compare(problems, objective, args.seconds):
                 print(f"{size:<25} | {objective:<14} | {line}", flush=True)
+    time_decisions(args.grid)
+    time_apart(args.grid, args.instances)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapp_env.compiled import kernel
 from mapp_env.map_format import (
     MAX_FILE_BYTES,
     MAX_SIDE,
@@ -22,10 +21,14 @@ from mapp_env.map_format import (
     parse_map,
     read_map,
 )
+from mapp_env.paths import fill_distances, fill_moves, trace_path
 from mapp_env.validation import as_array, as_integer, describe
 
 MAX_ALL_PAIRS_CELLS = 4096
 """Largest number of cells for which all pairs of distances are kept (64 MiB at 4096)."""
+
+MAX_LINES_BYTES = 8 << 30
+"""Largest size of the distances from some cells to all: those from 512 cells at 2048 x 2048."""
 
 FAR = np.int32(1 << 29)
 """More than any route of an agent, and twice it is still an int32."""
@@ -212,7 +215,17 @@ class Grid:
     def _cells(self, cells: Iterable[int]) -> NDArray[np.int32]:
         if not isinstance(cells, Iterable):
             raise ValueError(f"cells must be a sequence of cells, got {describe(cells)}")
-        return np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
+        if isinstance(cells, range) and cells == range(self.n_cells):
+            starts = np.arange(self.n_cells, dtype=np.int32)
+        else:
+            starts = np.array([self.cell("cells", cell) for cell in cells], dtype=np.int32)
+        size = 4 * len(starts) * self.n_cells
+        if size > MAX_LINES_BYTES:
+            raise ValueError(
+                f"cells: distances from {len(starts)} to all {self.n_cells} would take {size} "
+                f"bytes, allowed are {MAX_LINES_BYTES}"
+            )
+        return starts
 
     def _centre(self) -> int:
         """Return the free cell nearest to the middle of the grid."""
@@ -267,7 +280,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If a cell is off the grid.
+            If a cell is off the grid, or they would take more than 8 GiB.
         """
         starts = self._cells(cells)
         fields = np.empty((len(starts), self.n_cells), dtype=np.int32)
@@ -286,7 +299,7 @@ class Grid:
         Raises
         ------
         ValueError
-            If a cell is off the grid.
+            If a cell is off the grid, or they would take more than 8 GiB.
         """
         starts = self._cells(cells)
         row, col = np.divmod(np.arange(self.n_cells, dtype=np.int32), self.cols)
@@ -326,72 +339,6 @@ class Grid:
             f"Grid(rows={self.rows}, cols={self.cols}, depot={self.depot}, "
             f"walls={int(self.walls.sum())})"
         )
-
-
-@kernel
-def fill_moves(walls: NDArray[np.bool_], moves: NDArray[np.int32]) -> None:
-    """Write the cell that each move leads to, (C, 4 or more), on a grid with these walls."""
-    rows, cols = walls.shape
-    for row in range(rows):
-        for col in range(cols):
-            cell = row * cols + col
-            free = not walls[row, col]
-            moves[cell, 0] = cell - 1 if free and col > 0 and not walls[row, col - 1] else cell
-            moves[cell, 1] = (
-                cell + 1 if free and col + 1 < cols and not walls[row, col + 1] else cell
-            )
-            moves[cell, 2] = cell - cols if free and row > 0 and not walls[row - 1, col] else cell
-            moves[cell, 3] = (
-                cell + cols if free and row + 1 < rows and not walls[row + 1, col] else cell
-            )
-
-
-@kernel
-def fill_distances(
-    moves: NDArray[np.int32],
-    start: int,
-    steps: NDArray[np.int32],
-    queue: NDArray[np.int32],
-    stop: int = -1,
-) -> None:
-    """Breadth-first search: write the steps from a free cell to every cell, shape (C,).
-
-    They are -1 where unreachable. ``moves``, (C, 4 or more), is a table whose first four columns
-    are the moves; ``queue``, (C,), is scratch space. Beyond ``stop`` no distances are needed; those
-    of all nearer cells are complete.
-    """
-    steps[:] = -1
-    steps[start] = 0
-    # The start itself is never in the queue, so that a place is left behind the last cell found:
-    # each cell looked at is written there, and counted if it is new. Whether it is, is as good as
-    # random, and to guess it wrong would cost more than all the rest.
-    cell = np.uint32(start)
-    head = np.uint32(0)
-    tail = np.uint32(0)
-    while cell != stop:
-        ahead = np.uint32(steps[cell]) + np.uint32(1)
-        for action in range(4):
-            to = np.uint32(moves[cell, action])
-            known = np.uint32(steps[to])  # -1 becomes more than any number of steps
-            queue[tail] = to
-            tail += np.uint32(known > ahead)
-            steps[to] = min(known, ahead)
-        if head == tail:
-            return
-        cell = np.uint32(queue[head])
-        head += np.uint32(1)
-
-
-@kernel
-def trace_path(moves: NDArray[np.int32], steps: NDArray[np.int32], path: NDArray[np.int32]) -> None:
-    """Fill in a path from its first cell on, to where ``steps`` is 0: one step less each time."""
-    for place in range(1, path.shape[0]):
-        cell = path[place - 1]
-        for action in range(4):
-            to = moves[cell, action]
-            if steps[to] == steps[cell] - 1:
-                path[place] = to
-                break
 
 
 def pairs_of(grid: Grid, cells: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:

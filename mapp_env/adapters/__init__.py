@@ -7,5 +7,6 @@ Importing this package loads no trainer. Each of its modules loads the one that 
   Stable-Baselines3;
 - :mod:`mapp_env.adapters.sb3_rows`: what the two have in common;
 - :mod:`mapp_env.adapters.sb3_returns`: a callback that keeps episodes' returns and minds the clock;
+- :mod:`mapp_env.adapters.same_infos`: infos with the same entries at every step, for TorchRL;
 - :mod:`mapp_env.envs.tuple_env`: ``mapp_env/Tuple-v0`` for trainers in EPyMARL's manner.
 """

@@ -30,7 +30,7 @@ class MappSb3VecEnv(RowsVecEnv):
 
     - ``terminal_observation``: the last observation;
     - ``TimeLimit.truncated``: whether the step limit ended it, so that its value is bootstrapped;
-    - ``is_success``: whether all landmarks were visited, for the logged success rate;
+    - ``is_success``: whether the problem was solved, for the logged success rate;
     - ``metrics``: success, cover_time, makespan and total_distance;
     - ``episode``: return ``r``, length ``l`` and seconds ``t``, as ``Monitor`` gives them, so that
       no ``VecMonitor`` is needed.
@@ -246,9 +246,22 @@ class MappSb3VecEnv(RowsVecEnv):
     # -- pictures ----------------------------------------------------------------------
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Return a picture of each row, with ``render_mode="rgb_array"``."""
+        """Return a picture of each row, with ``render_mode="rgb_array"``.
+
+        All have one size, that of the largest grid of a pool.
+        """
         pictures = self.engine.render()
-        return [None] * self.num_envs if pictures is None else pictures
+        if pictures is None:
+            return [None] * self.num_envs
+        task = self.engine.task
+        if not task.is_pool:
+            return pictures
+        from mapp_env.rendering.rgb_array import pad_frames
+
+        shapes = {grid.walls.shape for grid in task.grids}
+        return pad_frames(
+            pictures, ((*shape, task.n_landmarks, self.max_cycles) for shape in shapes)
+        )
 
 
 def make_sb3_vec(num_envs: int, **arguments: Any) -> MappSb3VecEnv:

@@ -13,6 +13,8 @@ from mapp_env.compiled import kernel
 from mapp_env.engine.observation import observe_row
 from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
 from mapp_env.engine.state import (
+    FIRST,
+    N_CELLS,
     Packed,
     World,
     is_plain,
@@ -23,7 +25,7 @@ from mapp_env.engine.state import (
     unpack,
     world_at,
 )
-from mapp_env.grid import fill_distances
+from mapp_env.paths import fill_distances
 
 # Arrays, for signatures of one line.
 Int32s = NDArray[np.int32]
@@ -182,20 +184,31 @@ def _visit_rows(rows: Int32s, rewards: Float64s, terminated: Bools, world: Packe
 
 @kernel
 def fill_fields(
-    rows: Int32s, indices: Int64s, fields: Int32s, queue: Int32s, world: Packed
+    rows: Int32s, indices: Int64s, moves: Int32s, fields: Int32s, scratch: Int32s, world: Packed
 ) -> None:
-    """Write the steps from every landmark of some rows, where there are no distances of all pairs.
+    """Write the steps to every landmark of some rows, where there are no distances of all pairs.
 
-    Shapes: ``indices`` (M,), ``fields`` (B * K, C), ``queue`` (C,), C of the largest grid.
+    Shapes: ``indices`` (M,), ``moves`` (sum of C, 4) of all grids, ``fields`` (B * C, K) and
+    ``scratch`` (K + 1, C), C of the largest grid.
     """
     common = unpack(world)
+    size = scratch.shape[1]
     for index in indices:
         own = world_at(common, rows[index], index)
         state = split_row(rows[index], own.n_agents, own.n_landmarks)
-        n_cells = own.table.shape[0]
+        first, n_cells = own.grids[0, FIRST], own.grids[0, N_CELLS]
         for landmark in range(own.n_landmarks):
-            field = fields[index * own.n_landmarks + landmark, :n_cells]
-            fill_distances(own.table, state.landmarks[landmark], field, queue)
+            fill_distances(
+                moves[first : first + n_cells],
+                state.landmarks[landmark],
+                scratch[landmark, :n_cells],
+                scratch[own.n_landmarks, :n_cells],
+            )
+        # Turned, so that what a cell's neighbourhood needs lies close together.
+        field = fields[index * size : index * size + n_cells]
+        for cell in range(n_cells):
+            for landmark in range(own.n_landmarks):
+                field[cell, landmark] = scratch[landmark, cell]
 
 
 @kernel

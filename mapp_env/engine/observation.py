@@ -34,19 +34,18 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.state import (
-    COL,
+    COLS,
     DEPOT,
-    HOME,
-    LANDMARKS,
-    MASK,
+    MOVES,
     N_ACTIONS,
-    ROW,
-    WAIT,
-    WALL,
+    OPEN,
+    ROWS,
     WIDTH,
     State,
     World,
-    landmark_source,
+    next_cell,
+    path_steps,
+    row_and_col,
     split,
     split_row,
     state_length,
@@ -110,13 +109,7 @@ def observe_row(
     landmarks to walk towards, 0 for those that are visited.
     """
     state = split_row(row, world.n_agents, world.n_landmarks)
-    if world.actions == LANDMARKS:
-        for agent in range(world.n_agents):
-            for landmark in range(world.n_landmarks):
-                masks[agent, landmark] = 1 - state.visited[landmark]
-            masks[agent, world.n_landmarks] = 1
-    else:
-        _write_masks(state, world, masks)
+    _write_masks(state, world, masks)
     for agent in range(views.shape[0]):
         if world.observation == Observation.GLOBAL:
             for place in range(state.head.shape[0]):
@@ -133,16 +126,19 @@ def observe_row(
 
 @kernel
 def _write_masks(state: State, world: World, masks: NDArray[np.int8]) -> None:
-    if masks.shape[1] == N_ACTIONS:
+    if world.actions == MOVES and masks.shape[1] == N_ACTIONS:
         words = masks.view(np.int32)  # one by one they would be a tenth of a batched step
         for agent in range(world.n_agents):
-            words[agent, 0] = world.table[np.uint32(state.cells[agent]), MASK]
+            # The four bits, each to the lowest of a byte.
+            bits = np.int32(world.table[np.uint32(state.cells[agent]), OPEN]) & np.int32(15)
+            words[agent, 0] = bits * np.int32(0x00204081) & np.int32(0x01010101)
         return
     for agent in range(world.n_agents):
-        cell = state.cells[agent]
-        for action in range(N_ACTIONS):
-            masks[agent, action] = world.table[np.uint32(cell), action] != cell
-        masks[agent, WAIT] = 1
+        for action in range(masks.shape[1]):
+            if world.actions == MOVES:
+                masks[agent, action] = world.table[state.cells[agent], OPEN] >> action & 1
+            else:
+                masks[agent, action] = action == world.n_landmarks or state.visited[action] == 0
 
 
 @kernel
@@ -156,47 +152,46 @@ def _write_own_first(state: State, agent: int, out: NDArray[np.float32]) -> None
 
 @kernel
 def _write_planes(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
-    n_agents, table, width = world.n_agents, world.table, world.grids[0, WIDTH]
+    n_agents = world.n_agents
     size = out.shape[0] // N_PLANES
     own, others, unvisited, visited = 2 * size, 3 * size, 4 * size, 5 * size
     out[:size] = 1
     out[size:] = 0
-    for cell in range(table.shape[0]):
-        out[_place(table, cell, width)] = table[cell, WALL]
-    out[size + _place(table, world.grids[0, DEPOT], width)] = 1
-    out[own + _place(table, state.cells[agent], width)] = 1
+    for cell in range(world.table.shape[0]):
+        out[_place(world, cell)] = world.table[cell, OPEN] == 0
+    out[size + _place(world, world.grids[0, DEPOT])] = 1
+    out[own + _place(world, state.cells[agent])] = 1
     for other in range(n_agents):
         if other != agent:
             together = 0
             for another in range(n_agents):
                 together += another != agent and state.cells[another] == state.cells[other]
-            out[others + _place(table, state.cells[other], width)] = together / (n_agents - 1)
+            out[others + _place(world, state.cells[other])] = together / (n_agents - 1)
     for landmark in range(world.n_landmarks):
         plane = visited if state.visited[landmark] else unvisited
-        out[plane + _place(table, state.landmarks[landmark], width)] = 1
+        out[plane + _place(world, state.landmarks[landmark])] = 1
 
 
 @kernel
-def _place(table: NDArray[np.int32], cell: int, width: int) -> int:
-    """Return where a cell stands in a plane with rows of this width."""
-    return int(table[cell, ROW] * width + table[cell, COL])
+def _place(world: World, cell: int) -> int:
+    """Return where a cell stands in a plane."""
+    row, col = row_and_col(world, cell)
+    return int(row * world.grids[0, WIDTH] + col)
 
 
 @kernel
 def _write_geodesic(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
-    n_agents, table, distances = world.n_agents, world.table, world.paths
-    n_cells = table.shape[0]
-    scale = _half_perimeter(table)
+    n_agents, n_cells = world.n_agents, world.table.shape[0]
+    scale = world.grids[0, ROWS] + world.grids[0, COLS]
     cell = state.cells[agent]
     for landmark in range(world.n_landmarks):
-        source = landmark_source(state, landmark, world.first_path)
-        own = distances[source, cell]
+        own = path_steps(state, world, landmark, cell)
         nearest = FAR
         before = 0
         for other in range(n_agents):
             if other != agent:
-                distance = distances[source, state.cells[other]]
-                nearest = min(nearest, distance)
+                distance = path_steps(state, world, landmark, state.cells[other])
+                nearest = min(nearest, np.int32(distance))
                 before += distance < own or (distance == own and other < agent)
         place = N_FEATURES * landmark
         out[place] = 1 - state.visited[landmark]
@@ -204,31 +199,28 @@ def _write_geodesic(state: State, world: World, agent: int, out: NDArray[np.floa
         out[place + 2] = min(nearest, n_cells) / scale
         out[place + 3] = before / max(n_agents - 1, 1)
         for action in range(N_ACTIONS):
-            out[place + 4 + action] = distances[source, table[cell, action]] - own
+            to = next_cell(world, cell, action)
+            out[place + 4 + action] = path_steps(state, world, landmark, to) - own
 
 
 @kernel
 def _write_distances(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
-    n_agents, n_landmarks, table = world.n_agents, world.n_landmarks, world.table
-    scale = _half_perimeter(table)
+    n_agents, n_landmarks = world.n_agents, world.n_landmarks
+    scale = world.grids[0, ROWS] + world.grids[0, COLS]
     between = n_agents * n_landmarks
     home = between + n_landmarks * n_landmarks
+    flags = home + n_landmarks
+    place = 0
+    for rank in range(n_agents):
+        # Oneself first, then the others, lowest index first.
+        other = agent if rank == 0 else rank - 1 + (rank > agent)
+        for landmark in range(n_landmarks):
+            out[place] = path_steps(state, world, landmark, state.cells[other]) / scale
+            place += 1
     for landmark in range(n_landmarks):
-        steps = world.paths[landmark_source(state, landmark, world.first_path)]
-        out[landmark] = steps[state.cells[agent]] / scale
-        place = n_landmarks + landmark
-        for other in range(n_agents):
-            if other != agent:
-                out[place] = steps[state.cells[other]] / scale
-                place += n_landmarks
+        cell = state.landmarks[landmark]
         for other in range(n_landmarks):
-            out[between + landmark * n_landmarks + other] = steps[state.landmarks[other]] / scale
-        out[home + landmark] = table[state.landmarks[landmark], HOME] / scale
-        out[home + n_landmarks + landmark] = 1 - state.visited[landmark]
-
-
-@kernel
-def _half_perimeter(table: NDArray[np.int32]) -> int:
-    """Return rows + cols of a grid with this table."""
-    last = table.shape[0] - 1
-    return int(table[last, ROW] + 1 + table[last, COL] + 1)
+            steps = path_steps(state, world, other, cell)
+            out[between + landmark * n_landmarks + other] = steps / scale
+        out[home + landmark] = world.home[cell] / scale
+        out[flags + landmark] = 1 - state.visited[landmark]

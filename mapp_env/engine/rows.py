@@ -39,8 +39,9 @@ class Rows:
         self.longest = MAX_CYCLES  # upper bound of every step limit, whoever sets it
         self.views_shape = (n_views, task.view.low.size)
         self.masks_shape = (task.n_agents, task.n_actions)
-        n_fields = n_rows * task.n_landmarks if task.needs_fields else 0
-        self._fields = np.empty((n_fields, task.largest), np.int32)
+        needed = task.needs_fields
+        self._fields = np.empty((n_rows * task.largest * needed, task.n_landmarks), np.int32)
+        self._moves = np.concatenate([grid.moves for grid in task.grids]) if needed else None
         self._every_row = np.arange(n_rows)
         self._checked: NDArray[np.int64] | None = None
         # Pictures show where agents have been: their cells at each step, for each row.
@@ -66,9 +67,9 @@ class Rows:
         """
         limits = self.limits, self.max_cycles, self.longest
         reset_rows(self.array, indices, *problems, *limits, self.world)
-        if len(self._fields):
-            queue = np.empty(self.task.largest, np.int32)
-            fill_fields(self.array, indices, self._fields, queue, self.world)
+        if self._moves is not None:
+            scratch = np.empty((self.task.n_landmarks + 1, self.task.largest), np.int32)
+            fill_fields(self.array, indices, self._moves, self._fields, scratch, self.world)
         if self._trails is not None:
             for index in indices:
                 self._trails[index].clear()

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from mapp_env.compiled import kernel
 from mapp_env.engine.state import (
     ALL_PAIRS,
-    BY_COORDINATES,
+    COORDINATES,
     DEPOT,
-    HOME,
     LANDMARKS,
     N_ACTIONS,
     NO_DISTANCES,
@@ -25,9 +24,11 @@ from mapp_env.engine.state import (
     State,
     World,
     direct_steps,
-    landmark_source,
+    next_cell,
     path_distances,
+    path_steps,
     split_row,
+    steps_to,
 )
 from mapp_env.grid import FAR, Grid
 
@@ -48,7 +49,7 @@ PATH_REWARDS = (Reward.GEODESIC,)  # those that look up shortest paths
 def reward_distances(
     kind: Reward, grids: Sequence[Grid], fields: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], int]:
-    """Return the distances that a reward looks up, shape (S, C), and the first landmark's line.
+    """Return the distances that a reward looks up, and by what.
 
     Parameters are those of :func:`mapp_env.engine.world.make_world`.
     """
@@ -56,7 +57,7 @@ def reward_distances(
         return path_distances(grids, fields)
     # Grids of one shape have one table.
     if grids[0].n_cells > MAX_TABLE_CELLS or len({grid.walls.shape for grid in grids}) > 1:
-        return NO_DISTANCES, BY_COORDINATES
+        return NO_DISTANCES, COORDINATES
     table = grids[0].manhattan_from(range(grids[0].n_cells))
     table.flags.writeable = False
     return table, ALL_PAIRS
@@ -95,7 +96,7 @@ def step_row(
     state = split_row(row, world.n_agents, world.n_landmarks)
     move_row(state, actions, world)
     reward, terminated = visit_row(state, world)
-    return reward, terminated, not terminated and state.step[0] >= max_cycles
+    return reward, terminated, bool(not terminated and state.step[0] >= max_cycles)
 
 
 @kernel
@@ -107,7 +108,7 @@ def move_row(state: State, actions: NDArray[np.int64], world: World) -> None:
         move = actions[agent]
         if world.actions == LANDMARKS:
             move = _move_towards(state, world, cell, move)
-        to = world.table[np.uint32(cell), np.uint32(move)]
+        to = next_cell(world, cell, move)
         state.cells[agent] = to
         state.moved[agent] += to != cell
 
@@ -118,15 +119,14 @@ def _move_towards(state: State, world: World, cell: int, landmark: int) -> int:
 
     Without ``return_home`` one more landmark means to stay (R11).
     """
-    table = world.table
     if landmark < world.n_landmarks:
-        steps = world.paths[landmark_source(state, landmark, world.first_path)]
+        steps = path_steps(state, world, landmark, cell)
         for move in range(N_ACTIONS):
-            if steps[table[cell, move]] < steps[cell]:
+            if path_steps(state, world, landmark, next_cell(world, cell, move)) < steps:
                 return move
     elif world.return_home:
         for move in range(N_ACTIONS):
-            if table[table[cell, move], HOME] < table[cell, HOME]:
+            if world.home[next_cell(world, cell, move)] < world.home[cell]:
                 return move
     return WAIT
 
@@ -134,11 +134,10 @@ def _move_towards(state: State, world: World, cell: int, landmark: int) -> int:
 @kernel
 def visit_row(state: State, world: World) -> tuple[float, bool]:
     """Visit the landmarks under agents (R5); return the team reward (R6, R12) and if it is over."""
-    first = world.first_field
-    if first == BY_COORDINATES:
-        unvisited, distance = _visit(state, world, _nearest_by_coordinates, world.table, first)
+    if world.distances_at == COORDINATES:
+        unvisited, distance = _visit(state, world, direct_steps_to)
     else:
-        unvisited, distance = _visit(state, world, _nearest_by_table, world.distances, first)
+        unvisited, distance = _visit(state, world, looked_up_steps_to)
     if unvisited == 0:
         if world.return_home:
             distance = _steps_home(state, world)
@@ -150,25 +149,20 @@ def visit_row(state: State, world: World) -> tuple[float, bool]:
 
 
 @kernel
-def _steps_home(state: State, world: World) -> int:
-    """Return the sum of the agents' ways home, of the reward's kind; 0 only if all are there."""
-    total = 0
-    for agent in range(world.n_agents):
-        cell = state.cells[agent]
-        if world.reward == Reward.MANHATTAN:
-            total += direct_steps(world.table, cell, world.grids[0, DEPOT])
-        else:
-            total += world.table[cell, HOME]
-    return total
+def direct_steps_to(state: State, world: World, landmark: int, cell: int) -> int:
+    """Return the Manhattan distance from a cell to a landmark, computed."""
+    return int(direct_steps(world, cell, state.landmarks[landmark]))
+
+
+@kernel
+def looked_up_steps_to(state: State, world: World, landmark: int, cell: int) -> int:
+    """Return the distance of the reward's kind from a cell to a landmark, looked up."""
+    return int(steps_to(state, landmark, cell, world.distances, world.distances_at))
 
 
 @kernel
 def _visit(
-    state: State,
-    world: World,
-    nearest: Callable[[State, World, int, NDArray[np.int32], int], int],
-    distances: NDArray[np.int32],
-    first_field: int,
+    state: State, world: World, distance_of: Callable[[State, World, int, int], int]
 ) -> tuple[int, int]:
     """Return how many landmarks are left, and the sum of their distances from the nearest agent."""
     unvisited = 0
@@ -177,7 +171,10 @@ def _visit(
         # All landmarks alike, visited or not: whether one is visited is as good as random to the
         # processor, and a branch on it would cost more than a distance.
         flag = state.visited[landmark]
-        distance = nearest(state, world, landmark, distances, first_field)
+        distance = FAR
+        for agent in range(world.n_agents):
+            steps = distance_of(state, world, landmark, state.cells[agent])
+            distance = min(distance, np.int32(steps))
         if (distance == 0) & (flag == 0):
             _claim(state, landmark)
             flag = np.int32(1)
@@ -188,27 +185,16 @@ def _visit(
 
 
 @kernel
-def _nearest_by_table(
-    state: State, world: World, landmark: int, distances: NDArray[np.int32], first_field: int
-) -> int:
-    """Return the distance from the nearest agent to a landmark, looked up."""
-    source = np.uint32(landmark_source(state, landmark, first_field))
-    least = FAR
+def _steps_home(state: State, world: World) -> int:
+    """Return the sum of the agents' ways home, of the reward's kind; 0 only if all are there."""
+    total = 0
     for agent in range(world.n_agents):
-        least = min(least, distances[source, np.uint32(state.cells[agent])])
-    return least  # type: ignore[return-value]
-
-
-@kernel
-def _nearest_by_coordinates(
-    state: State, world: World, landmark: int, table: NDArray[np.int32], first_field: int
-) -> int:
-    """Return the Manhattan distance from the nearest agent to a landmark, computed."""
-    cell = state.landmarks[landmark]
-    least = FAR
-    for agent in range(world.n_agents):
-        least = min(least, np.int32(direct_steps(table, state.cells[agent], cell)))
-    return least  # type: ignore[return-value]
+        cell = state.cells[agent]
+        if world.reward == Reward.MANHATTAN:
+            total += direct_steps(world, cell, world.grids[0, DEPOT])
+        else:
+            total += world.home[cell]
+    return total
 
 
 @kernel
@@ -245,12 +231,12 @@ def measure_row(row: NDArray[np.int32], world: World) -> tuple[float, float, flo
         step = state.claim_steps[agent]
         cover_time = max(cover_time, step)
         if world.return_home:
-            if world.table[state.cells[agent], HOME] > 0:
+            if world.home[state.cells[agent]] > 0:
                 return np.inf, np.inf, np.inf
             makespan = state.step[0]
             distance += state.moved[agent]
         elif step > 0:
-            home = world.table[state.claim_cells[agent], HOME]
+            home = world.home[state.claim_cells[agent]]
             makespan = max(makespan, step + home)
             distance += state.claim_moved[agent] + home
     return float(cover_time), float(makespan), float(distance)

@@ -23,13 +23,19 @@ from mapp_env.grid import Grid
 N_ACTIONS = 4  # left, right, up, down: the paper's order (R3)
 WAIT = 4
 MOVES, LANDMARKS = 0, 1  # what actions are: moves, or landmarks to walk towards (R11)
-ROW, COL, HOME, WALL, MASK = 5, 6, 7, 8, 9  # columns of a table, after the five moves
 
-FIRST, N_CELLS, DEPOT, WIDTH = 0, 1, 2, 3  # columns of a world's grids
+# Columns of a world's grids: the first cell in table and home, how many there are, which of them
+# is the depot, rows, columns, columns of the widest grid, and what turns a cell into its row.
+FIRST, N_CELLS, DEPOT, ROWS, COLS, WIDTH, RECIPROCAL = range(7)
+OPEN = 5  # column of a table, after what the five moves add to a cell
 
-# Where the distances of a row's landmarks stand: from this line of `distances` on, or
-ALL_PAIRS = -1  # in `distances`, in the line of each landmark's cell
-BY_COORDINATES = -2  # nowhere: Manhattan distances are computed from rows and columns
+# `cell // cols` is `cell * RECIPROCAL >> SHIFT`, exactly for 2048 x 2048 cells, without a division.
+SHIFT = 36
+
+# What distances are looked up by:
+COORDINATES = -2  # nothing, if Manhattan distances are computed from rows and columns
+ALL_PAIRS = -1  # the two cells
+# or, from 0 on, the cell and the landmark, in as many lines for each row of a batch
 
 # Distances are read-only arrays without exception: numba would compile a second version of every
 # kernel for others.
@@ -44,7 +50,11 @@ with :func:`unpack`."""
 
 
 class World(NamedTuple):
-    """What the rules look up; :func:`mapp_env.engine.world.make_world` makes one of G grids."""
+    """What the rules look up; :func:`mapp_env.engine.world.make_world` makes one of G grids.
+
+    For a row, :func:`world_at`, it has its own grid alone, and ``distances_at`` and ``paths_at``
+    are its first lines.
+    """
 
     n_agents: int  # N
     n_landmarks: int  # K
@@ -52,12 +62,13 @@ class World(NamedTuple):
     observation: int  # an Observation
     actions: int  # MOVES or LANDMARKS
     return_home: int  # 1 if the team walks home (R12), else 0
-    first_field: int  # line of the first landmark in distances, ALL_PAIRS or BY_COORDINATES
-    first_path: int  # line of the first landmark in paths, or ALL_PAIRS
-    grids: NDArray[np.int32]  # (G, 4): first line in table, cells C, depot, columns of the widest
-    table: NDArray[np.int32]  # (sum of C, 10), from cell_table, grid after grid; cells are local
-    distances: NDArray[np.int32]  # (S, C), from sources to cells: the reward's
-    paths: NDArray[np.int32]  # (S, C), shortest paths: the observation's and the actions'
+    distances_at: int  # lines of distances for each row, ALL_PAIRS or COORDINATES
+    paths_at: int  # lines of paths for each row, or ALL_PAIRS
+    grids: NDArray[np.int64]  # (G, 7), see FIRST to RECIPROCAL; cells are local
+    table: NDArray[np.int16]  # (sum of C, 6), grid after grid; from cell_table
+    home: NDArray[np.int32]  # (sum of C,), steps to the depot
+    distances: NDArray[np.int32]  # (C, C) or (B * C, K), the reward's
+    paths: NDArray[np.int32]  # the same, shortest paths: the observation's and the actions'
 
 
 def pack(world: World) -> Packed:
@@ -68,7 +79,7 @@ def pack(world: World) -> Packed:
 @kernel
 def unpack(packed: Packed) -> World:
     """Return the world that was packed."""
-    numbers, grids, table, distances, paths = packed
+    numbers, grids, table, home, distances, paths = packed
     return World(
         numbers[0],
         numbers[1],
@@ -80,6 +91,7 @@ def unpack(packed: Packed) -> World:
         numbers[7],
         grids,
         table,
+        home,
         distances,
         paths,
     )
@@ -149,20 +161,21 @@ def is_plain(world: World) -> bool:
 
 @kernel
 def world_at(world: World, row: NDArray[np.int32], index: int, plain: bool = False) -> World:
-    """Return the world as a row sees it: its own grid alone, and its own K lines of fields.
+    """Return the world as a row sees it: its own grid and its own lines of distances.
 
-    ``index`` is the row's number among those that fields are kept for. Where a caller writes True
+    ``index`` is the row's number among those that lines are kept for. Where a caller writes True
     for ``plain``, of a world that is, the compiler leaves out of its loop what else there may be.
     """
     actions, return_home = world.actions, world.return_home
-    grids, table = world.grids, world.table
+    grids, table, home = world.grids, world.table, world.home
     if plain:
         actions, return_home = MOVES, 0
     elif grids.shape[0] > 1:
         which = split_row(row, world.n_agents, world.n_landmarks).grid[0]
         grids = grids[which : which + 1]
-        table = table[grids[0, FIRST] : grids[0, FIRST] + grids[0, N_CELLS]]
-    first, first_path = world.first_field, world.first_path
+        first, end = grids[0, FIRST], grids[0, FIRST] + grids[0, N_CELLS]
+        table, home = table[first:end], home[first:end]
+    distances_at, paths_at = world.distances_at, world.paths_at
     return World(
         world.n_agents,
         world.n_landmarks,
@@ -170,34 +183,65 @@ def world_at(world: World, row: NDArray[np.int32], index: int, plain: bool = Fal
         world.observation,
         actions,
         return_home,
-        first if first < 0 else index * world.n_landmarks,
-        first_path if first_path < 0 else index * world.n_landmarks,
+        distances_at if distances_at < 0 else distances_at * index,
+        paths_at if paths_at < 0 else paths_at * index,
         grids,
         table,
+        home,
         world.distances,
         world.paths,
     )
 
 
-@kernel
-def landmark_source(state: State, landmark: int, first_field: int) -> int:
-    """Return the line of distances with the steps from a landmark."""
-    if first_field == ALL_PAIRS:
-        return int(state.landmarks[landmark])
-    return first_field + landmark
+# -- looking up ------------------------------------------------------------------------
 
 
 @kernel
-def direct_steps(table: NDArray[np.int32], start: int, end: int) -> int:
-    """Return the Manhattan distance between two cells of a grid with this table."""
-    a, b = np.uint32(start), np.uint32(end)
-    return int(abs(table[a, ROW] - table[b, ROW]) + abs(table[a, COL] - table[b, COL]))
+def next_cell(world: World, cell: int, action: int) -> int:
+    """Return where an action leads: to the cell itself, if it is to wait or bumps."""
+    return int(cell + world.table[np.uint32(cell), np.uint32(action)])
+
+
+@kernel
+def row_and_col(world: World, cell: int) -> tuple[int, int]:
+    """Return a cell's row and column."""
+    row = (cell * world.grids[0, RECIPROCAL]) >> SHIFT
+    return row, cell - row * world.grids[0, COLS]
+
+
+@kernel
+def direct_steps(world: World, start: int, end: int) -> int:
+    """Return the Manhattan distance between two cells."""
+    row, col = row_and_col(world, start)
+    other_row, other_col = row_and_col(world, end)
+    return int(abs(row - other_row) + abs(col - other_col))
+
+
+@kernel
+def steps_to(
+    state: State, landmark: int, cell: int, distances: NDArray[np.int32], distances_at: int
+) -> int:
+    """Return the distance from a cell to a landmark, looked up."""
+    if distances_at == ALL_PAIRS:
+        return int(distances[np.uint32(state.landmarks[landmark]), np.uint32(cell)])
+    return int(distances[np.uint32(distances_at + cell), np.uint32(landmark)])
+
+
+@kernel
+def path_steps(state: State, world: World, landmark: int, cell: int) -> int:
+    """Return the steps of a shortest path from a cell to a landmark."""
+    return int(steps_to(state, landmark, cell, world.paths, world.paths_at))
+
+
+# -- making tables ---------------------------------------------------------------------
 
 
 def path_distances(
     grids: Sequence[Grid], fields: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], int]:
-    """Return shortest paths as a world holds them: of all pairs, or the rows' fields if it has any.
+    """Return shortest paths as a world holds them, and by what they are looked up.
+
+    They are those of all pairs, or the rows' ``fields`` if there are any, see ``make_world``.
 
     Raises a ValueError if there are no fields and the grid, which must be a single one then, is too
     large for all pairs.
@@ -207,21 +251,21 @@ def path_distances(
         return grid.distances, ALL_PAIRS
     lines = fields.view()
     lines.flags.writeable = False
-    return lines, 0
+    return lines, max(grid.n_cells for grid in grids)
 
 
-def cell_table(grid: Grid) -> NDArray[np.int32]:
-    """Return the grid as the kernels read it, shape (C, 10) int32, one line a cell.
+def cell_table(grid: Grid) -> NDArray[np.int16]:
+    """Return the grid as the rules read it, shape (C, 6) int16, one line a cell.
 
-    ``[ next cell for left, right, up, down, wait | row, col | steps home | 1 for a wall | mask ]``,
-    so that borders and walls vanish from the rules. The mask is four int8 in one word: 0 for a move
-    that bumps, else 1.
+    ``[ what left, right, up, down, wait add to a cell | open ]``: 0 for a move that bumps, so that
+    borders and walls vanish from the rules. Open has a bit for each action that bumps nothing, the
+    lowest for left; a wall is 0. Short lines, as thousands of grids should stay in the cache.
     """
-    cells = np.arange(grid.n_cells, dtype=np.int32)
-    table = np.empty((grid.n_cells, MASK + 1), np.int32)
-    table[:, :WAIT], table[:, WAIT] = grid.moves, cells
-    table[:, ROW], table[:, COL] = np.divmod(cells, np.int32(grid.cols))
-    table[:, HOME], table[:, WALL] = grid.home, grid.walls.ravel()
-    table[:, MASK] = (grid.moves != cells[:, None]).view(np.int32)[:, 0]
-    table.flags.writeable = False
-    return table
+    free = np.pad(~grid.walls, 1)
+    ways = free[1:-1, :-2], free[1:-1, 2:], free[:-2, 1:-1], free[2:, 1:-1], free[1:-1, 1:-1]
+    table = np.zeros((*grid.walls.shape, OPEN + 1), np.int16)
+    for action, stride in enumerate((-1, 1, -grid.cols, grid.cols, 0)):
+        way = ways[action] & ~grid.walls
+        table[..., action] = way * stride
+        table[..., OPEN] |= way.astype(np.int16) << action
+    return table.reshape(grid.n_cells, -1)

@@ -14,6 +14,7 @@ from mapp_env.engine.state import (
     LANDMARKS,
     MOVES,
     NO_DISTANCES,
+    SHIFT,
     World,
     cell_table,
     path_distances,
@@ -38,28 +39,19 @@ def make_world(
 ) -> World:
     """Return what the rules look up on a grid, or on several; sizes are not checked here.
 
-    ``fields``, shape (B * K, C), C of the largest grid, is where shortest paths from the rows'
+    ``fields``, shape (B * C, K), C of the largest grid, is where shortest paths from the rows'
     landmarks will stand; if it is empty, those of all pairs do. Raises a ValueError if shortest
     paths are looked up, without fields, on several grids or on one too large for all pairs.
     """
     pool = (grids,) if isinstance(grids, Grid) else tuple(grids)
-    tables = [cell_table(grid) for grid in pool]
-    sizes = [len(table) for table in tables]
-    width = max(grid.cols for grid in pool)
-    lines = np.array(
-        [
-            (first, size, grid.depot, width)
-            for first, size, grid in zip(np.cumsum([0, *sizes[:-1]]), sizes, pool, strict=True)
-        ],
-        np.int32,
-    )
-    table = tables[0] if len(tables) == 1 else np.concatenate(tables)
-    for array in (lines, table):
-        array.flags.writeable = False
-    distances, first_field = reward_distances(reward, pool, fields)
-    paths, first_path = NO_DISTANCES, ALL_PAIRS
+    distances, distances_at = reward_distances(reward, pool, fields)
+    paths, paths_at = NO_DISTANCES, ALL_PAIRS
     if observation in PATH_OBSERVATIONS or actions == LANDMARKS:
-        paths, first_path = path_distances(pool, fields)
+        paths, paths_at = path_distances(pool, fields)
+    lines, table = _describe(pool), np.concatenate([cell_table(grid) for grid in pool])
+    home = np.concatenate([grid.home for grid in pool])
+    for array in (lines, table, home):
+        array.flags.writeable = False
     return World(
         n_agents,
         n_landmarks,
@@ -67,10 +59,23 @@ def make_world(
         int(observation),
         actions,
         int(return_home),
-        first_field,
-        first_path,
+        distances_at,
+        paths_at,
         lines,
         table,
+        home,
         distances,
         paths,
     )
+
+
+def _describe(grids: Sequence[Grid]) -> NDArray[np.int64]:
+    """Return a line of numbers for each grid, see ``state.FIRST`` to ``RECIPROCAL``, (G, 7)."""
+    sizes = [grid.n_cells for grid in grids]
+    firsts = np.cumsum([0, *sizes[:-1]]).tolist()
+    width = max(grid.cols for grid in grids)
+    lines = [
+        (first, size, grid.depot, grid.rows, grid.cols, width, -(-(1 << SHIFT) // grid.cols))
+        for first, size, grid in zip(firsts, sizes, grids, strict=True)
+    ]
+    return np.array(lines, np.int64)

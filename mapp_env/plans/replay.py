@@ -57,17 +57,20 @@ def _play(problem: Problem, data: bytes) -> Episode:
     )
     claims: list[list[int]] = [[] for _ in range(n_agents)]
     claim_steps: list[list[int]] = [[] for _ in range(n_agents)]
-    order = np.argsort(visits[:, 0], kind="stable")
-    for landmark, (step, agent) in zip(order.tolist(), visits[order].tolist(), strict=True):
+    order = np.argsort(visits[:, 0], kind="stable").tolist()
+    flat = visits.tolist()
+    last, home = np.zeros(n_agents, np.int64), 0
+    for landmark in order:
+        step, agent = flat[landmark]
         if step > 0:
             claims[agent].append(problem.landmarks[landmark])
             claim_steps[agent].append(step)
-    last = np.array([max(found, default=0) for found in claim_steps])
-    home = max(int(grid.home[found[-1]]) if found else 0 for found in claims)
+            last[agent] = step
+            home = max(home, grid.home.item(problem.landmarks[landmark]))
     tours, lengths = np.empty((n_agents, steps + 1 + home), np.int32), np.empty_like(last)
     close_tours(grid.moves, grid.home, cells, last, tours, lengths)
     return Episode(
-        tuple(tuple(tour[:length]) for tour, length in zip(tours.tolist(), lengths, strict=True)),
+        tuple(tuple(tour[:n].tolist()) for tour, n in zip(tours, lengths.tolist(), strict=True)),
         tuple(map(tuple, claims)),
         tuple(map(tuple, claim_steps)),
         tuple(map(tuple, actions[:steps].tolist())),

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.state import N_ACTIONS, WAIT
-from mapp_env.grid import FAR, fill_distances, trace_path
+from mapp_env.grid import FAR
+from mapp_env.paths import fill_distances, trace_path
 
 Cells = NDArray[np.int32]
 

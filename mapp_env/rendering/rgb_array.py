@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -67,6 +68,25 @@ def rgb_array(scene: Scene, max_side: int = MAX_SIDE) -> Frame:
     _draw_agents(frame, layout, scene)
     _draw_status(frame, layout, scene)
     return frame
+
+
+def pad_frames(frames: Sequence[Frame], scenes: Iterable[tuple[int, int, int, int]]) -> list[Frame]:
+    """Return frames, each at the top left of a sheet of the size that all of them fit on.
+
+    So do the frames of ``scenes`` to come: rows, columns, number of landmarks and step limit of
+    each. Videos need frames of one size, also where each episode is on another grid.
+    """
+    sides = [frame.shape[:2] for frame in frames]
+    for scene in scenes:
+        layout = _layout(*scene, MAX_SIDE)
+        sides.append((layout.height + BAR, layout.width))
+    sheet = np.empty((*np.max(sides, axis=0), 3), np.uint8)
+    sheet[:] = palette.PAPER
+    padded = []
+    for frame in frames:
+        padded.append(sheet.copy())
+        padded[-1][: frame.shape[0], : frame.shape[1]] = frame
+    return padded
 
 
 @dataclass(frozen=True)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from mapp_env.compiled import clock
-from mapp_env.plans.plan import OBJECTIVES, Plan, replay
+from mapp_env.plans.plan import OBJECTIVES, Plan
+from mapp_env.plans.replay import play_episode
 from mapp_env.plans.tours import walk_routes
 from mapp_env.problem import Problem
 from mapp_env.solvers.batch import optimal_costs, solve_universe
 from mapp_env.solvers.bounds import tree_bound
 from mapp_env.solvers.exact import MAX_EXACT_LANDMARKS, solve_exact
 from mapp_env.solvers.oracle import next_costs, next_costs_of, regrets
-from mapp_env.solvers.solution import Routes, Solution, Solver
+from mapp_env.solvers.solution import Distances, Routes, Solution, Solver
 from mapp_env.solvers.vrplib import save_vrplib
 from mapp_env.validation import MAX_SEED, as_real, check_choice, check_count, describe
 
@@ -34,6 +36,7 @@ __all__ = [
 
 METHODS = ("auto", "exact", "search", "pyvrp")
 
+TREE_SECONDS = 3e-7  # that the bound by spanning trees takes, for each pair of nodes
 QUICK_LANDMARKS = 16  # that the exact solver takes a fraction of a second for; for 20, two seconds
 
 
@@ -49,7 +52,8 @@ def solve(
     Parameters
     ----------
     problem : Problem
-        Its step limit is ignored: it belongs to an episode, not to the optimum.
+        Its agents may start anywhere. Its step limit is ignored: it belongs to an episode, not to
+        the optimum.
     objective : {"cover_time", "makespan", "total_distance"}
         What is minimised. Ties in the first two go to the smaller total distance, with "exact"
         always.
@@ -112,9 +116,10 @@ def solve_many(
     Returns
     -------
     list of Plan
-        In the order of the problems. The ``bound`` of "search" is the one that takes a tenth of a
-        millisecond (spanning trees, and the farthest landmark) without the optimum of twelve of the
-        landmarks, so it proves less often than that of :func:`solve`.
+        In the order of the problems. The ``bound`` of "search" proves less often than that of
+        :func:`solve`: it is that of spanning trees and of the farthest landmark, without the
+        optimum of twelve of the landmarks; and of the farthest landmark alone where the trees would
+        take more than a fourth of the time limit: within a millisecond, from 30 landmarks on.
 
     Raises
     ------
@@ -137,8 +142,16 @@ def solve_many(
             raise ValueError(f"iterations is for method 'search', got {describe(method)}")
         limit, options["iterations"] = None, check_count("iterations", iterations, 1, 10**12)
     if method == "search":
-        options["bound"] = partial(tree_bound, objective=objective)
+        options["bound"] = partial(_quick_bound, objective, limit)
     return [_solve(problem, objective, method, limit, seed, **options) for problem in every]
+
+
+def _quick_bound(objective: str, limit: float | None, distances: Distances) -> int:
+    """Return a lower bound that takes at most about a fourth of a time limit, if there is one."""
+    if limit is None or TREE_SECONDS * len(distances.between) ** 2 < limit / 4:
+        return tree_bound(distances, objective)
+    back = distances.between[0] if objective != "cover_time" else 0
+    return int((distances.starts.min(axis=0) + back)[1:].max())
 
 
 def _check(
@@ -165,8 +178,7 @@ def _solve(
     solver = _solver(method)
     start = clock()
     solution = solver(problem, objective, time_limit=limit, seed=seed, **options)
-    plan = _plan_of(problem, objective, solution)
-    return replace(plan, solver=method, seconds=clock() - start)
+    return _plan_of(problem, objective, solution, method, start)
 
 
 def _solver(method: str) -> Solver:
@@ -182,19 +194,36 @@ def _solver(method: str) -> Solver:
     return solve_exact
 
 
-def _plan_of(problem: Problem, objective: str, solution: Solution) -> Plan:
-    """Return what the rules make of a solver's routes, if that is what the solver claims."""
+def _plan_of(
+    problem: Problem,
+    objective: str,
+    solution: Solution,
+    method: str = "replay",
+    start: float = math.inf,
+) -> Plan:
+    """Return what the rules make of a solver's routes, if that is what the solver claims.
+
+    ``start`` is when the ``method`` began, by the clock.
+    """
     routes = _idle_last(problem, solution.routes)
     endless = problem if problem.max_cycles is None else replace(problem, max_cycles=None)
-    plan = replay(endless, walk_routes(problem, routes), objective)
-    claimed = plan.cost == solution.bound if solution.optimal else plan.cost >= solution.bound
-    if not plan.success or not claimed:
+    episode = play_episode(endless, walk_routes(problem, routes))
+    cost = getattr(episode, objective)
+    claimed = cost == solution.bound if solution.optimal else cost >= solution.bound
+    if cost == math.inf or not claimed:
         raise RuntimeError(
             f"a solver claims the bound {solution.bound} (optimal={solution.optimal}), but its "
-            f"routes cost {plan.cost}: please report {problem!r}, objective {objective!r}"
+            f"routes cost {cost}: please report {problem!r}, objective {objective!r}"
         )
-    status = "optimal" if plan.cost == solution.bound else "feasible"
-    return replace(plan, problem=problem, status=status, bound=solution.bound)
+    return Plan(
+        **episode._asdict(),
+        objective=objective,
+        status="optimal" if cost == solution.bound else "feasible",
+        solver=method,
+        seconds=max(0.0, clock() - start),
+        bound=solution.bound,
+        problem=problem,
+    )
 
 
 def _idle_last(problem: Problem, routes: Routes) -> Routes:
@@ -202,9 +231,10 @@ def _idle_last(problem: Problem, routes: Routes) -> Routes:
 
     Such agents are exchangeable, and who comes later may follow: see ``walk_tours``.
     """
-    order = sorted(range(len(routes)), key=lambda agent: not routes[agent])
-    left = {
-        cell: [n for n in order if problem.start_cells[n] == cell]
-        for cell in set(problem.start_cells)
-    }
-    return tuple(routes[left[cell].pop(0)] for cell in problem.start_cells)
+    if all(routes):
+        return routes
+    left: dict[int, list[tuple[int, ...]]] = {}
+    for cell, route in zip(problem.start_cells, routes, strict=True):
+        left.setdefault(cell, []).append(route)
+    ordered = {cell: iter(sorted(line, key=lambda route: not route)) for cell, line in left.items()}
+    return tuple(next(ordered[cell]) for cell in problem.start_cells)

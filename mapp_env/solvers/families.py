@@ -1,12 +1,10 @@
-"""Within which limit a team can visit all landmarks, and who then visits which of them.
+"""Within which limit a team can visit all landmarks.
 
 Agents that start together are alike, and so is what a set of landmarks costs them; agents that
 start elsewhere have costs of their own.
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -232,95 +230,3 @@ def tours_from(
             if (home if closed else least) <= limit:
                 tour = min(tour, home)
         tours[members] = tour
-
-
-# -- who visits what -----------------------------------------------------
-
-
-def split_among(
-    distances: Distances, closed: bool, limit: int, tours: Sequence[Steps]
-) -> list[int]:
-    """Return for each agent its set: disjoint, all landmarks together, the least sum of tours.
-
-    ``tours``, (2 ** K,) each, are what each set costs an agent, ``FAR`` if it cannot visit it
-    within the limit, within which all together visit everything.
-    """
-    if len(tours) == 1:
-        return [len(tours[0]) - 1]
-    sizes = np.zeros(1, np.int64)
-    while len(sizes) < len(tours[0]):
-        sizes = np.concatenate((sizes, sizes + 1))
-    # For each set how many sets it may be joined to. The first agent and the last have no table of
-    # pairs to fill in, so these are the two with most.
-    shares = (len(sizes) >> sizes).astype(np.float64)
-    pairs = np.array([shares[table < FAR].sum() for table in tours])
-    order = np.argsort(-pairs)
-    order = np.append(np.delete(order, 1), order[1])
-    between, starts = distances
-    before = fewest_agents(Distances(between, starts[order]), closed, limit)
-    after = fewest_agents(Distances(between, starts[order[::-1]]), closed, limit)[::-1]
-    tables = [tours[order[0]]]
-    for place, agent in enumerate(order[1:-1], 1):
-        wanted = (before <= place + 1) & (after <= len(order) - 1 - place)
-        more = np.where(wanted, tables[-1], FAR)
-        if (1 << sizes[wanted]).sum() < pairs[agent]:
-            add_any_part(tours[agent], tables[-1], wanted, more)
-        else:
-            parts = np.flatnonzero(tours[agent] < FAR)
-            add_each_part(tours[agent], parts, tables[-1], wanted, more)
-        tables.append(more)
-    left = len(sizes) - 1
-    found = [0] * len(tours)
-    for agent, sums in zip(order[:0:-1], tables[::-1], strict=True):
-        found[agent] = int(best_part(tours[agent], sums, left))
-        left ^= found[agent]
-    found[order[0]] = left
-    return found
-
-
-@kernel
-def add_any_part(tours: Steps, sums: Steps, wanted: NDArray[np.bool_], more: Steps) -> None:
-    """Lower ``more``, the least sums of tours with one agent more, from each wanted set down."""
-    for left in range(1, more.shape[0]):
-        if not wanted[left]:
-            continue
-        least = more[left]
-        part = left
-        while part != 0:
-            least = min(least, np.int32(tours[part] + sums[left ^ part]))
-            part = (part - 1) & left
-        more[left] = least
-
-
-@kernel
-def add_each_part(
-    tours: Steps, parts: NDArray[np.int64], sums: Steps, wanted: NDArray[np.bool_], more: Steps
-) -> None:
-    """Lower ``more`` as :func:`add_any_part` does, from each of the agent's sets up."""
-    everything = more.shape[0] - 1
-    for part in parts:
-        others = everything ^ part
-        rest = others
-        while True:
-            if wanted[part | rest]:
-                more[part | rest] = min(more[part | rest], np.int32(tours[part] + sums[rest]))
-            if rest == 0:
-                break
-            rest = (rest - 1) & others
-
-
-@kernel
-def best_part(tours: Steps, sums: Steps, left: int) -> int:
-    """Return the part of a set that an agent added last visits; among equals the smallest."""
-    least = 2 * FAR
-    best = 0
-    part = left
-    while True:
-        steps = tours[part] + sums[left ^ part]
-        if steps <= least:
-            least = steps
-            best = part
-        if part == 0:
-            break
-        part = (part - 1) & left
-    return best

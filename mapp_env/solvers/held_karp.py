@@ -123,33 +123,22 @@ def trace_route(
 # -- from several starts -------------------------------------------------
 
 
-def agent_costs(between: Steps, starts: Steps, closed: bool) -> list[Steps]:
-    """Return for each agent what each set of landmarks costs it, N tables of (2 ** K,) steps.
+def joined_sums(between: Steps, starts: Steps) -> list[Steps]:
+    """Return the least sums of closed tours through each set for the first 0, 1, ... agents.
 
-    ``between``, (K + 1, K + 1), and ``starts``, (N, K + 1), are
-    :class:`~mapp_env.solvers.solution.Distances`. Agents whose ways are equally long share a table.
+    N + 1 tables, (2 ** K,). Agents that are of no use to those before share their table.
     """
-    routes = routes_onward(between, closed)
-    tables: dict[bytes, Steps] = {}
-    for start in starts:
-        if start.tobytes() not in tables:
-            costs = tables[start.tobytes()] = np.empty(len(routes), np.int32)
-            route_costs(start[None], routes, True, costs)
-    return [tables[start.tobytes()] for start in starts]
-
-
-def routes_onward(between: Steps, closed: bool) -> Steps:
-    """Return the steps from each landmark through all of a set that holds it, (2 ** K, K).
-
-    A closed tour goes on to the depot. Ways are equally long in both directions, so these are
-    routes that come from the depot, or from nowhere, and end on that landmark.
-    """
-    ways = between.copy()
-    if not closed:
-        ways[0] = ways[:, 0] = 0
     routes = np.empty((1 << (len(between) - 1), len(between) - 1), np.int32)
-    shortest_routes(ways, routes)
-    return routes
+    tables = [np.full(len(routes), FAR, np.int32)]
+    tables[0][0] = 0
+    for agent, start in enumerate(starts):
+        more = tables[-1]
+        # One more like the last, who was of no use, is of none either.
+        if agent == 0 or tables[-1] is not tables[-2] or (start != starts[agent - 1]).any():
+            more = np.empty_like(more)
+            join_agent(between, start, tables[-1], routes, more)
+        tables.append(tables[-1] if np.array_equal(more, tables[-1]) else more)
+    return tables
 
 
 @kernel

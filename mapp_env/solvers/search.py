@@ -30,7 +30,7 @@ from mapp_env.validation import check_count
 
 DEFAULT_ITERATIONS = 200_000  # without a time limit: well under a second for 50 landmarks
 MAX_ITERATIONS = 10**12
-FEW, CHUNK = 16, 500  # iterations between two looks at the clock: some milliseconds at most
+FEWEST, FEW, CHUNK = 4, 16, 500  # iterations between two looks at the clock
 
 # In units of the mean distance between landmarks over the square root of their number: roughly
 # from one landmark to the next.
@@ -81,8 +81,8 @@ def solve_search(
         if start >= deadline:
             break
         # As many as there is time for, as far as the last ones tell, but for the very first.
-        left = 0 if chunk == 1 else chunk * (deadline - start) / max(start - before, 1e-9)
-        chunk = int(min(max(left, FEW), CHUNK))
+        left = FEW if chunk == 1 else chunk * (deadline - start) / max(start - before, 1e-9)
+        chunk = int(min(max(left, FEWEST), CHUNK))
     return solution_of(problem, search.routes(), search.cost, low)
 
 

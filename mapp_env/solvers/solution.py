@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.grid import Grid, fill_distances
+from mapp_env.grid import Grid
+from mapp_env.paths import fill_distances
 from mapp_env.problem import Problem
 
 UNBOUNDED = 1 << 60  # more than any cost, weighted or scaled; twice it is still an int64

@@ -229,3 +229,25 @@ def test_trainers_run(form: str) -> None:
         2, **{**SETTINGS, **{k: v for k, v in FORMS[form].items() if k != "central_action"}}
     )
     PPO("MlpPolicy", shared, n_steps=16, batch_size=32, seed=0).learn(64)
+
+
+def test_pictures_of_a_pool_have_one_size() -> None:
+    """SB3 tiles, and records, the pictures of rows on grids of any size; none is cut or changed."""
+    grids = [mapp_env.Grid(np.zeros(shape, bool)) for shape in ((2, 9), (7, 3), (12, 1))]
+    envs = make_sb3_vec(2, **{**SETTINGS, "grid": grids, "render_mode": "rgb_array"})
+    shapes, drawn = set(), set()
+    for wanted in ([0, 1], [2, 2], [1, 0], [0, 0]):
+        envs.set_options({"grid": wanted})
+        envs.reset()
+        padded, plain = envs.get_images(), envs.engine.render()
+        for sheet, picture in zip(padded, plain, strict=True):
+            height, width = picture.shape[:2]
+            assert np.array_equal(sheet[:height, :width], picture)
+            assert (sheet[height:] == 255).all()
+            assert (sheet[:, width:] == 255).all()
+            shapes.add(sheet.shape)
+            drawn.add(picture.shape)
+        assert envs.render().shape[2] == 3
+    assert len(shapes) == 1
+    assert len(drawn) == 3
+    assert shapes == {tuple(np.max(list(drawn), axis=0).tolist())}

@@ -161,7 +161,9 @@ def test_games_are_not_vacuous() -> None:
             seen["all visited, not home"] += all(model.visited) and not model.terminated
         seen["all grids drawn"] += len(grids) == len(game.pool) > 1
         seen["sizes"] += len(shapes) > 2
+        seen["one size"] += len(shapes) == 1 < len(set(game.pool))
         seen[game.actions, game.return_home, game.reward] += 1
+        seen["face", seed % 3, game.reward] += len(game.pool) > 1
         seen[game.actions, kind_of(seed)] += 1
         seen["pocket"] += any(
             sum(row.count(".") for row in rows) > len(mapp_env_cells(rows)) for rows in game.pool
@@ -169,7 +171,7 @@ def test_games_are_not_vacuous() -> None:
         seen["N", game.n_agents] += 1
         seen["K", game.n_landmarks] += 1
         seen["pool", len(game.pool)] += 1
-    assert len(seen) == 8 + 12 + 2 * len(OBSERVATIONS) + 5 + 6 + 8 + 5
+    assert len(seen) == 8 + 12 + 9 + 2 * len(OBSERVATIONS) + 6 + 6 + 8 + 5
     assert all(count >= 2 for count in seen.values()), seen
 
 
@@ -311,7 +313,7 @@ def batch_reset(
     game: Game, batch: Batch, rows: list[int], rng: random.Random
 ) -> dict[str, Any] | None:
     """Reset rows of the model in one of the forms that options have; return the options."""
-    form = rng.randrange(7)
+    form = rng.randrange(8)
     n_rows, n_grids = len(batch.words), len(game.pool)
     if form == 0:
         grid = rng.randrange(n_grids)
@@ -329,6 +331,13 @@ def batch_reset(
         for row in rows:
             batch.give(row, grids[row], game.episode(grids[row], cells[row]))
         return {"grid": grids, "landmarks": np.array(cells)}
+    if form == 7:  # the same landmarks for all rows
+        grid = rng.randrange(n_grids)
+        cells = random_landmarks(rng, game.pool[grid], game.n_landmarks)
+        for row in rows:
+            batch.give(row, grid, game.episode(grid, cells))
+        pairs = [divmod(cell, len(game.pool[grid][0])) for cell in cells]
+        return {"grid": [grid] * n_rows, "landmarks": rng.choice((list(cells), pairs))}
     if form == 4:
         grid, model = given_problem(game, rng)
         problem = the_problem(game, grid, model)

@@ -191,3 +191,27 @@ def test_supersuit_vectorises(actions: str) -> None:
             observations, rewards, *_ = venv.step(moves)
             assert len(set(rewards[:3])) == len(set(rewards[3:])) == 1
         venv.close()
+
+
+@pytest.mark.parametrize("mode", ["rgb_array", "ansi"])
+def test_pictures_are_of_the_episodes_grid(mode: str) -> None:
+    """What is shown of an episode on a pool is what its grid alone would show, row by row too."""
+    settings: dict[str, Any] = {"n_landmarks": 4, "render_mode": mode, "actions": "landmarks"}
+    env = mapp_v0.parallel_env(grid=POOL, **settings)
+    envs = mapp_env.make_vec(len(POOL), grid=POOL, **settings)
+    envs.reset(seed=0)
+    pictures = {}
+    for grid in (0, 2, 1, 0):
+        single = mapp_v0.parallel_env(grid=POOL[grid], **settings)
+        single.reset(seed=4)
+        env.reset(seed=4, options={"grid": grid})
+        for _ in range(3):
+            pictures[grid] = env.render()
+            assert np.array_equal(pictures[grid], single.render())
+            for each in (env, single):
+                each.step(dict.fromkeys(each.agents, 1))
+    envs.reset(seed=[4] * len(POOL), options={"grid": range(len(POOL))})
+    for _ in range(2):
+        envs.step(np.ones((len(POOL), 3), int))
+    for grid, picture in enumerate(envs.render()):
+        assert np.array_equal(picture, pictures[grid])

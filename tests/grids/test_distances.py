@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mapp_env import Grid
-from mapp_env.engine.state import cell_table
-from mapp_env.grid import fill_distances
+from mapp_env.paths import fill_distances
 
 
 def steps_from(walls: NDArray[np.bool_], start: int) -> list[int]:
@@ -41,7 +40,7 @@ def test_distances_are_those_of_a_plain_search() -> None:
     rng = np.random.default_rng(11)
     for _ in range(150):
         grid = Grid(random_walls(rng))
-        wide = cell_table(grid)
+        wide = np.column_stack([grid.moves, grid.moves[:, :2]])
         walls = grid.walls.ravel()
         nowhere = [-1] * grid.n_cells
         for start, line in enumerate(grid.distances.tolist()):

@@ -52,6 +52,7 @@ LETTERS = (
     "." * 30 + "x",
     ".#SWE",
     ".é#",
+    ".\xae#",  # 128 more than a full stop
     ".D\0#",
     ".\ud800",
 )

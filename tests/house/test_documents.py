@@ -28,6 +28,7 @@ EXAMPLES = {
     "sb3_central.py": ["--seconds", "1", "--problems", "5"],
     "sb3_vec.py": ["--seconds", "1", "--problems", "5"],
     "epymarl_style.py": ["--seconds", "1", "--problems", "5"],
+    "many_maps.py": ["--seconds", "1", "--problems", "5", "--maps", "20"],
     "torchrl_vdn.py": ["--steps", "80", "--updates-per-batch", "1", "--problems", "5"],
 }
 # Run by hand: what they need does not install beside the rest, or they start many trainings (which
@@ -82,7 +83,8 @@ def test_example_runs(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["sb3_central.py", "sb3_shared.py", "sb3_vec.py", "epymarl_style.py"]
+    "name",
+    ["sb3_central.py", "sb3_shared.py", "sb3_vec.py", "epymarl_style.py", "many_maps.py"],
 )
 def test_trainings_refuse_before_they_train(name: str, tmp_path: Path) -> None:
     """What could not be reported on is refused in one line before a minute is spent on it."""
@@ -273,8 +275,8 @@ def test_rules_table_names_what_exists() -> None:
     """Each rule's row names functions of the package and tests of the suite."""
     text = (REPOSITORY / "docs" / "rules.md").read_text(encoding="utf-8")
     tests = all_tests()
-    rows = re.findall(r"^\| (R\d) \|.*\| (.*?) \| (.*?) \|$", text, re.MULTILINE)
-    assert [rule for rule, _, _ in rows] == [f"R{number}" for number in range(1, 10)]
+    rows = re.findall(r"^\| (R\d+) \|.*\| (.*?) \| (.*?) \|$", text, re.MULTILINE)
+    assert [rule for rule, _, _ in rows] == [f"R{number}" for number in range(1, 13)]
     for rule, functions, names in rows:
         found = re.findall(r"`(test_\w+)`", names)
         assert found, rule

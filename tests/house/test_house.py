@@ -23,6 +23,7 @@ LAYERS: tuple[str, ...] = (
     "mapp_env.files",
     "mapp_env.records",
     "mapp_env.map_format",
+    "mapp_env.paths",
     "mapp_env.grid",
     "mapp_env.grids",
     "mapp_env.engine.state",  # the rules stand below what is played by them

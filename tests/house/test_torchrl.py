@@ -14,9 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from model import OBSERVATIONS
+from pettingzoo.utils import BaseParallelWrapper
 from tensordict import TensorDictBase
 
+import mapp_env
 from mapp_env import mapp_v0
+from mapp_env.adapters.same_infos import SameInfos
 
 with warnings.catch_warnings():  # TorchRL uses, while imported, what it deprecates itself
     warnings.filterwarnings("ignore", "Creating .*WeightUpdater which", DeprecationWarning)
@@ -50,10 +54,61 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 @pytest.mark.parametrize("use_mask", [False, True])
-@pytest.mark.parametrize("observation", ["global", "own_first", "planes", "geodesic"])
+@pytest.mark.parametrize("observation", OBSERVATIONS)
 def test_specs(observation: str, use_mask: bool) -> None:
     """TorchRL's check passes for each observation, without and with a mask of living agents."""
     check_env_specs(wrap(use_mask, observation=observation, allow_wait=use_mask), seed=3)
+
+
+POOL = [
+    mapp_env.make_grid(),
+    mapp_env.Grid.from_text("...\n.D.\n...\n.#.\n"),
+    mapp_env.Grid.from_text("....D..."),
+]
+
+
+@pytest.mark.parametrize("return_home", [False, True])
+@pytest.mark.parametrize("actions", ["moves", "landmarks"])
+@pytest.mark.parametrize("pool", [False, True])
+def test_specs_of_pools_and_landmarks(pool: bool, actions: str, return_home: bool) -> None:
+    """TorchRL's check passes with landmark actions, the way home and, by SameInfos, with a pool.
+
+    What it plays is what the environment says, the number of the grid included, over ends.
+    """
+    arguments: dict[str, Any] = {
+        **SHORT,
+        "observation": "distances",
+        "actions": actions,
+        "return_home": return_home,
+        **({"grid": POOL} if pool else {}),
+    }
+    single = mapp_v0.parallel_env(**arguments)
+    env = PettingZooWrapper(
+        SameInfos(single) if pool else single, categorical_actions=True, return_state=True
+    )
+    check_env_specs(env, seed=3)
+    env.set_seed(4)
+    torch.manual_seed(0)
+    played = env.rollout(60, break_when_any_done=False)
+    twin = mapp_v0.parallel_env(**arguments)
+    twin.reset(seed=4)
+    observations, infos = twin.reset()  # TorchRL resets once to seed, once to play
+    grids, ends = set(), 0
+    for row in played:
+        if not twin.agents:
+            observations, infos = twin.reset()
+            ends += 1
+        names = twin.possible_agents
+        seen = np.stack([observations[name] for name in names])
+        assert torch.equal(row["agent", "observation"], torch.as_tensor(seen))
+        if pool:
+            assert row["agent", "info", "grid"].tolist() == [infos[name]["grid"] for name in names]
+            grids.add(infos["agent_0"]["grid"])
+        moves = dict(zip(names, row["agent", "action"].tolist(), strict=True))
+        observations, _, terminated, _, infos = twin.step(moves)
+        assert row["next", "terminated"].item() is terminated["agent_0"]
+    assert ends > 3
+    assert grids == ({0, 1, 2} if pool else set())
 
 
 def scalar_steps(played: TensorDictBase, seed: int, **arguments: Any) -> list[dict[str, Any]]:
@@ -112,6 +167,53 @@ def test_transitions_arrive_to_the_bit(observation: str) -> None:
         assert row["next", "done"].tolist() == [step["ended"]]
         ends.add((bool(row["next", "terminated"]), bool(row["next", "truncated"])))
     assert ends == {(False, False), (True, False), (False, True)}
+
+
+class MasksAlone(BaseParallelWrapper):
+    """The environment, with infos that hold nothing but the action masks."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Return observations and masks."""
+        observations, infos = super().reset(seed, options)
+        return observations, self.without_others(infos)
+
+    def step(self, actions: dict[str, int]) -> Any:
+        """Return all else as it is."""
+        *results, infos = super().step(actions)
+        return *results, self.without_others(infos)
+
+    def without_others(self, infos: dict[str, Any]) -> dict[str, Any]:
+        """Return the masks."""
+        return {agent: {"action_mask": info["action_mask"]} for agent, info in infos.items()}
+
+
+@pytest.mark.parametrize("home", [False, True])
+@pytest.mark.parametrize("actions", ["moves", "landmarks"])
+def test_pools_arrive_to_the_bit(actions: str, home: bool) -> None:
+    """Without grids and metrics in infos, TorchRL plays pools, landmark actions and ways home."""
+    arguments: dict[str, Any] = {
+        "grid": [mapp_env.make_grid(), mapp_env.Grid.from_text("...\n.D.\n")],
+        "observation": "distances",
+        "n_landmarks": 2,
+        "max_cycles": 9,
+        "actions": actions,
+        "return_home": home,
+    }
+    env = PettingZooWrapper(
+        MasksAlone(mapp_v0.parallel_env(**arguments)), categorical_actions=True, return_state=True
+    )
+    check_env_specs(env, seed=3)
+    ends = 0
+    played = collect(env, 5, 150)
+    for row, step in zip(played, scalar_steps(played, 5, **arguments), strict=True):
+        group, names = row["next", "agent"], step["names"]
+        assert torch.equal(row["agent", "observation"], torch.as_tensor(step["observation"]))
+        assert torch.equal(group["observation"], torch.as_tensor(step["next observation"]))
+        assert torch.equal(row["agent", "action_mask"], torch.as_tensor(step["action_mask"] != 0))
+        assert group["reward"][:, 0].tolist() == [step["rewards"][name] for name in names]
+        assert row["next", "done"].tolist() == [step["ended"]]
+        ends += step["ended"]
+    assert ends > 3
 
 
 def test_last_masks_are_made_again(example: ModuleType) -> None:

@@ -107,6 +107,19 @@ def test_searches_within_a_time_limit() -> None:
     assert sums[1] < sums[0]
 
 
+def test_the_bound_leaves_time_for_the_search() -> None:
+    """Where spanning trees would take most of the limit, the farthest landmark bounds the cost."""
+    grid = make_grid("rooms", rows=32, cols=32, seed=0)
+    problem = Problem(grid, sample_problems(grid, 1, 120, 0)[0].tolist(), 2)
+    home = grid.home[list(problem.landmarks)].max()
+    for objective, farthest in zip(OBJECTIVES, (home, 2 * home, 2 * home), strict=True):
+        (short,) = solve_many([problem], objective, time_limit=0.001)
+        (longer,) = solve_many([problem], objective, iterations=20)
+        assert short.bound == farthest
+        assert longer.bound is not None
+        assert farthest < longer.bound <= longer.cost
+
+
 def test_nothing_to_solve() -> None:
     """No problems, no plans."""
     assert solve_many([]) == []

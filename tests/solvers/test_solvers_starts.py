@@ -19,7 +19,7 @@ from mapp_env.engine.rules import measure_row, reset_row, step_row
 from mapp_env.engine.state import State, new_rows, split
 from mapp_env.engine.world import make_world
 from mapp_env.grid import FAR
-from mapp_env.solvers import exact, families
+from mapp_env.solvers import exact, families, partition
 from mapp_env.solvers.bounds import lower_bound, tree_bound
 from mapp_env.solvers.exact import solve_exact
 from mapp_env.solvers.solution import Distances, Solution, problem_distances
@@ -249,25 +249,26 @@ def plain_split(tours: list[np.ndarray]) -> int:
 
 
 def test_every_way_of_joining_agents_gives_the_least_sum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether sets are looked at from the whole or from an agent's part, the sum is the least."""
+    """Whether sets are looked at from the whole or from a part, all of them or the hopeful ones."""
     rng = np.random.default_rng(20)
     used = {"add_any_part": 0, "add_each_part": 0}
     for name in used:
-        kernel = getattr(families, name)
+        kernel = getattr(partition, name)
 
         def counted(*arguments: Any, name: str = name, kernel: Any = kernel) -> None:
             used[name] += 1
             kernel(*arguments)
 
-        monkeypatch.setattr(families, name, counted)
-    for _ in range(40):
+        monkeypatch.setattr(partition, name, counted)
+    for _ in range(30):
         problem = random_problem(rng, 8, 7, (9, 9), 6, 3)
         distances = problem_distances(problem)
         for closed in (False, True):
             limit = families.smallest_limit_from(distances, closed)
-            for slack in (0, 3, 30):
+            for slack, many in ((0, 0), (3, 10**9), (3, 0), (30, 10**9)):
+                monkeypatch.setattr(partition, "MANY_PAIRS", many)
                 tours = tour_tables(distances, closed, limit + slack)
-                parts = families.split_among(distances, closed, limit + slack, tours)
+                parts = partition.split_among(distances, closed, limit + slack, tours)
                 assert sum(parts) == len(tours[0]) - 1 == np.bitwise_or.reduce(parts)
                 costs = [int(table[part]) for table, part in zip(tours, parts, strict=True)]
                 assert sum(costs) == plain_split(tours)
