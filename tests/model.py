@@ -28,8 +28,7 @@ PAPER_ROWS = (
 MOVES = ((0, -1), (0, 1), (-1, 0), (1, 0), (0, 0))
 
 REWARDS = ("manhattan", "geodesic", "step")
-OBSERVATIONS = ("global", "own_first", "planes", "geodesic")
-OBSERVATIONS += ("distances",)
+OBSERVATIONS = ("global", "own_first", "planes", "geodesic", "distances")
 
 
 def depot_of(rows: Sequence[str]) -> int:
