@@ -28,13 +28,15 @@ def grid_of(rows: tuple[str, ...]) -> mapp_env.Grid:
     return mapp_env.Grid.from_text("\n".join(rows) + "\n")
 
 
-def small_problem(seed: int) -> tuple[tuple[str, ...], mapp_env.Problem]:
+def small_problem(seed: int, away: bool = False) -> tuple[tuple[str, ...], mapp_env.Problem]:
     """Return a random grid and a problem on it that the exact solver solves at once."""
     rng, game = random.Random(seed), random_game(seed)
     rows = game.pool[0]
     count = min(game.n_landmarks, 5)
     cells = random_landmarks(rng, rows, count)
-    return rows, mapp_env.Problem(grid_of(rows), cells, min(game.n_agents, 4))
+    n_agents = min(game.n_agents, 4)
+    starts = random_starts(rng, Game((rows,), n_agents, count).episode(0, cells)) if away else None
+    return rows, mapp_env.Problem(grid_of(rows), cells, n_agents, starts=starts)
 
 
 def make_central(problem: mapp_env.Problem, **changes: Any) -> gymnasium.Env:
@@ -52,14 +54,16 @@ def make_central(problem: mapp_env.Problem, **changes: Any) -> gymnasium.Env:
 
 
 @pytest.mark.parametrize("reward", REWARDS)
-@pytest.mark.parametrize("seed", range(30))
-def test_walking_optimal_tours_home_takes_the_optimum(seed: int, reward: str) -> None:
+@pytest.mark.parametrize("away", [False, True])
+@pytest.mark.parametrize("seed", range(24))
+def test_walking_optimal_tours_home_takes_the_optimum(seed: int, away: bool, reward: str) -> None:
     """Agents that walk the tours of least makespan, then home, end the episode at that step.
 
     Each walks to the landmarks that it claims in the plan, in their order, by landmark actions.
     With the reward "step" the return is then one less than minus the optimum, as the last is 0.
+    An agent without a landmark has no tour, but it has to come home as well if it starts away.
     """
-    _, problem = small_problem(seed)
+    _, problem = small_problem(seed, away)
     plan = mapp_env.solve(problem, objective="makespan")
     assert plan.status == "optimal"
     env = make_central(problem, actions="landmarks", return_home=True, reward=reward)
@@ -76,10 +80,16 @@ def test_walking_optimal_tours_home_takes_the_optimum(seed: int, reward: str) ->
         total, steps = total + value, steps + 1
         assert not truncated
         assert (value == 0) is over
-    assert steps == plan.makespan == info["metrics"]["makespan"]
-    assert info["metrics"]["total_distance"] <= sum(max(len(tour) - 1, 0) for tour in plan.tours)
+    idle = [
+        int(problem.grid.home[start])
+        for start, tour in zip(problem.start_cells, plan.tours, strict=True)
+        if not tour
+    ]
+    assert steps == max(plan.makespan, *idle, 0) == info["metrics"]["makespan"]
+    walked = sum(max(len(tour) - 1, 0) for tour in plan.tours)
+    assert info["metrics"]["total_distance"] <= walked + sum(idle)
     if reward == "step":
-        assert total == 1 - plan.makespan
+        assert total == 1 - steps
     assert cells == [problem.grid.depot] * problem.n_agents
 
 

@@ -384,8 +384,10 @@ def test_batches_play_the_model(seed: int, mode: str) -> None:
     check_batch_infos(infos, list(batch.models), batch.grids)
     ends = 0
     for step in range(90):
+        states = envs.state()
         for row, model in enumerate(batch.models):
             check_team(observations[row], model, kind)
+            check_numbers(states[row], model, "global", 0)
         assert envs.observation_space.contains(observations)
         rows = [row for row in range(N_ROWS) if batch.waiting[row]]
         if (mode == "Disabled" and rows) or step % 13 == 5:

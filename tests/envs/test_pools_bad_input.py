@@ -110,6 +110,21 @@ def test_pools_whose_tables_do_not_fit(face: str, changes: dict[str, Any]) -> No
         refusal(lambda: make(face, grid=pool, **changes), r"\bgrid\b", str(2**30))
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [{"actions": "landmarks"}, {"observation": "distances"}, {"reward": "geodesic"}],
+    ids=str,
+)
+def test_rows_whose_paths_do_not_fit(changes: dict[str, Any]) -> None:
+    """A batch keeps paths as long as its largest grid: more than 1 GiB of them are refused."""
+    pool = [LINE, mapp_env.Grid(np.zeros((64, 64), bool))]
+    most = 2**30 // (4 * 4096 * 3)
+    arguments = {**SETTINGS, "grid": pool, **changes}
+    with little_memory(2**26):
+        refusal(lambda: mapp_env.make_vec(most + 1, **arguments), "64|4096", str(2**30))
+    mapp_env.make_vec(64, **arguments).reset(seed=0)
+
+
 BAD_OPTIONS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "beyond the last": ({"grid": 3}, (r"options\['grid'\]", r"\b3\b", r"0\.\.2")),
     "negative": ({"grid": -1}, (r"options\['grid'\]", "-1")),
