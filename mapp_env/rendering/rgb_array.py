@@ -78,7 +78,7 @@ def pad_frames(frames: Sequence[Frame], scenes: Iterable[tuple[int, int, int, in
     """
     sides = [frame.shape[:2] for frame in frames]
     for scene in scenes:
-        layout = _layout(*scene, MAX_SIDE)
+        layout = _layout(*scene, MAX_SIDE, False)  # an episode does not know what it lost
         sides.append((layout.height + BAR, layout.width))
     sheet = np.empty((*np.max(sides, axis=0), 3), np.uint8)
     sheet[:] = palette.PAPER
