@@ -147,7 +147,7 @@ class Grid:
         depot : int or (int, int), optional
             As for :meth:`from_text`.
         free, walls : str or set of str, optional
-            As for :meth:`from_text`.
+            What other letters mean, as for :meth:`from_text`.
 
         Raises
         ------

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from mapp_env import Grid
+from mapp_env.map_format import MAX_SIDE
 from mapp_env.problem import MAX_AGENTS, MAX_LANDMARKS
 from mapp_env.validation import check_choice, check_count, check_flag
 
@@ -41,7 +42,7 @@ class NetworkSpec:
 
     def __post_init__(self) -> None:
         sizes = ("n_agents", 1, MAX_AGENTS), ("n_landmarks", 1, MAX_LANDMARKS)
-        for name, least, most in (*sizes, ("n_cells", 2, 512 * 512)):
+        for name, least, most in (*sizes, ("n_cells", 2, MAX_SIDE**2)):
             size = getattr(self, name)
             if name not in self.any_size or size != ANY:
                 check_count(name, size, least, most)

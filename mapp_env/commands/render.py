@@ -100,7 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     if lost is not None:
         record["regrets"] = lost.tolist()
         steps = (f"{step + 1} ({lost[step]})" for step in np.flatnonzero(lost))
-        lines.append(f"{lost.sum()} steps lost, by step: {', '.join(steps) or 'none'}")
+        lines.append(f"steps lost: {lost.sum()}, by step: {', '.join(steps) or 'none'}")
     reports.print_report(arguments, {**record, **reports.costs_record(plan)}, lines)
 
 

@@ -13,7 +13,6 @@ from mapp_env.compiled import kernel
 from mapp_env.engine.observation import observe_row
 from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
 from mapp_env.engine.state import (
-    FIRST,
     N_CELLS,
     Packed,
     World,
@@ -196,7 +195,7 @@ def fill_fields(
     for index in indices:
         own = world_at(common, rows[index], index)
         state = split_row(rows[index], own.n_agents, own.n_landmarks)
-        first, n_cells = own.grids[0, FIRST], own.grids[0, N_CELLS]
+        first, n_cells = own.cells_at, own.grids[own.grid, N_CELLS]
         for landmark in range(own.n_landmarks):
             fill_distances(
                 moves[first : first + n_cells],

@@ -38,7 +38,7 @@ from mapp_env.engine.state import (
     DEPOT,
     MOVES,
     N_ACTIONS,
-    OPEN,
+    N_CELLS,
     ROWS,
     WIDTH,
     State,
@@ -49,6 +49,8 @@ from mapp_env.engine.state import (
     split,
     split_row,
     state_length,
+    steps_home,
+    ways_from,
 )
 from mapp_env.grid import FAR, Grid
 
@@ -130,13 +132,13 @@ def _write_masks(state: State, world: World, masks: NDArray[np.int8]) -> None:
         words = masks.view(np.int32)  # one by one they would be a tenth of a batched step
         for agent in range(world.n_agents):
             # The four bits, each to the lowest of a byte.
-            bits = np.int32(world.table[np.uint32(state.cells[agent]), OPEN]) & np.int32(15)
+            bits = np.int32(ways_from(world, state.cells[agent])) & np.int32(15)
             words[agent, 0] = bits * np.int32(0x00204081) & np.int32(0x01010101)
         return
     for agent in range(world.n_agents):
         for action in range(masks.shape[1]):
             if world.actions == MOVES:
-                masks[agent, action] = world.table[state.cells[agent], OPEN] >> action & 1
+                masks[agent, action] = ways_from(world, state.cells[agent]) >> action & 1
             else:
                 masks[agent, action] = action == world.n_landmarks or state.visited[action] == 0
 
@@ -157,9 +159,9 @@ def _write_planes(state: State, world: World, agent: int, out: NDArray[np.float3
     own, others, unvisited, visited = 2 * size, 3 * size, 4 * size, 5 * size
     out[:size] = 1
     out[size:] = 0
-    for cell in range(world.table.shape[0]):
-        out[_place(world, cell)] = world.table[cell, OPEN] == 0
-    out[size + _place(world, world.grids[0, DEPOT])] = 1
+    for cell in range(world.grids[world.grid, N_CELLS]):
+        out[_place(world, cell)] = ways_from(world, cell) == 0
+    out[size + _place(world, world.grids[world.grid, DEPOT])] = 1
     out[own + _place(world, state.cells[agent])] = 1
     for other in range(n_agents):
         if other != agent:
@@ -176,13 +178,13 @@ def _write_planes(state: State, world: World, agent: int, out: NDArray[np.float3
 def _place(world: World, cell: int) -> int:
     """Return where a cell stands in a plane."""
     row, col = row_and_col(world, cell)
-    return int(row * world.grids[0, WIDTH] + col)
+    return int(row * world.grids[world.grid, WIDTH] + col)
 
 
 @kernel
 def _write_geodesic(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
-    n_agents, n_cells = world.n_agents, world.table.shape[0]
-    scale = world.grids[0, ROWS] + world.grids[0, COLS]
+    n_agents, n_cells = world.n_agents, world.grids[world.grid, N_CELLS]
+    scale = world.grids[world.grid, ROWS] + world.grids[world.grid, COLS]
     cell = state.cells[agent]
     for landmark in range(world.n_landmarks):
         own = path_steps(state, world, landmark, cell)
@@ -206,7 +208,7 @@ def _write_geodesic(state: State, world: World, agent: int, out: NDArray[np.floa
 @kernel
 def _write_distances(state: State, world: World, agent: int, out: NDArray[np.float32]) -> None:
     n_agents, n_landmarks = world.n_agents, world.n_landmarks
-    scale = world.grids[0, ROWS] + world.grids[0, COLS]
+    scale = world.grids[world.grid, ROWS] + world.grids[world.grid, COLS]
     between = n_agents * n_landmarks
     home = between + n_landmarks * n_landmarks
     flags = home + n_landmarks
@@ -222,5 +224,5 @@ def _write_distances(state: State, world: World, agent: int, out: NDArray[np.flo
         for other in range(n_landmarks):
             steps = path_steps(state, world, other, cell)
             out[between + landmark * n_landmarks + other] = steps / scale
-        out[home + landmark] = world.home[cell] / scale
+        out[home + landmark] = steps_home(world, cell) / scale
         out[flags + landmark] = 1 - state.visited[landmark]

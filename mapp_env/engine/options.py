@@ -65,11 +65,7 @@ def check_options(source: Source, task: Task, options: Mapping[str, Any] | None)
 
     Raises a ValueError if the options are invalid.
     """
-    _check_dict(options)
-    if not options:
-        return NOTHING
-    problem, landmarks, grid = (options.get(name) for name in ("problem", "landmarks", "grid"))
-    _check_alone(problem, landmarks, grid)
+    landmarks, grid, problem = _read(options)
     if problem is not None:
         return Asked(NO_GRIDS, stack_problems(task, [problem], ["options['problem']"]))
     index = None if grid is None else check_grid_number(task, grid)
@@ -91,11 +87,7 @@ def check_problems(
 
     Raises a ValueError if the options are invalid.
     """
-    _check_dict(options)
-    if not options:
-        return NOTHING
-    problem, landmarks, grid = (options.get(name) for name in ("problem", "landmarks", "grid"))
-    _check_alone(problem, landmarks, grid)
+    landmarks, grid, problem = _read(options)
     if isinstance(problem, Sequence):
         if len(problem) != n_rows:
             raise ValueError(
@@ -193,10 +185,14 @@ def _check_dict(options: object) -> None:
         raise ValueError(f"options must be a dict or None, got {describe(options)}")
 
 
-def _check_alone(problem: object, landmarks: object, grid: object) -> None:
+def _read(options: Mapping[str, Any] | None) -> tuple[Any, Any, Any]:
+    """Return the values of ``OPTIONS``, ``None`` where there is none."""
+    _check_dict(options)
+    landmarks, grid, problem = (None if not options else options.get(name) for name in OPTIONS)
     for name, value in (("landmarks", landmarks), ("grid", grid)):
         if problem is not None and value is not None:
             raise ValueError(f"options must hold 'problem' or {name!r}, got both")
+    return landmarks, grid, problem
 
 
 def _the_grid(task: Task, index: int | None) -> int:

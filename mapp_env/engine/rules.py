@@ -28,6 +28,7 @@ from mapp_env.engine.state import (
     path_distances,
     path_steps,
     split_row,
+    steps_home,
     steps_to,
 )
 from mapp_env.grid import FAR, Grid
@@ -126,7 +127,7 @@ def _move_towards(state: State, world: World, cell: int, landmark: int) -> int:
                 return move
     elif world.return_home:
         for move in range(N_ACTIONS):
-            if world.home[next_cell(world, cell, move)] < world.home[cell]:
+            if steps_home(world, next_cell(world, cell, move)) < steps_home(world, cell):
                 return move
     return WAIT
 
@@ -191,9 +192,9 @@ def _steps_home(state: State, world: World) -> int:
     for agent in range(world.n_agents):
         cell = state.cells[agent]
         if world.reward == Reward.MANHATTAN:
-            total += direct_steps(world, cell, world.grids[0, DEPOT])
+            total += direct_steps(world, cell, world.grids[world.grid, DEPOT])
         else:
-            total += world.home[cell]
+            total += steps_home(world, cell)
     return total
 
 
@@ -231,12 +232,12 @@ def measure_row(row: NDArray[np.int32], world: World) -> tuple[float, float, flo
         step = state.claim_steps[agent]
         cover_time = max(cover_time, step)
         if world.return_home:
-            if world.home[state.cells[agent]] > 0:
+            if steps_home(world, state.cells[agent]) > 0:
                 return np.inf, np.inf, np.inf
             makespan = state.step[0]
             distance += state.moved[agent]
         elif step > 0:
-            home = world.home[state.claim_cells[agent]]
+            home = steps_home(world, state.claim_cells[agent])
             makespan = max(makespan, step + home)
             distance += state.claim_moved[agent] + home
     return float(cover_time), float(makespan), float(distance)

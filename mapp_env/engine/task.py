@@ -24,7 +24,7 @@ ACTIONS = ("moves", "landmarks")  # in the order of state.MOVES and state.LANDMA
 MAX_BYTES = 1 << 30
 """Largest array of one kind (tables, observations, paths) that an environment may need."""
 
-TABLE_BYTES = 32  # of a cell in a world's tables, its home, and moves where paths are looked up
+TABLE_BYTES = 21  # of a cell in a world's open and home, and moves where paths are looked up
 
 
 class GridLike:

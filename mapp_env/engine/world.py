@@ -15,9 +15,11 @@ from mapp_env.engine.state import (
     MOVES,
     NO_DISTANCES,
     SHIFT,
+    WAYS,
     World,
-    cell_table,
+    open_actions,
     path_distances,
+    strides_of,
 )
 from mapp_env.grid import Grid
 
@@ -48,9 +50,11 @@ def make_world(
     paths, paths_at = NO_DISTANCES, ALL_PAIRS
     if observation in PATH_OBSERVATIONS or actions == LANDMARKS:
         paths, paths_at = path_distances(pool, fields)
-    lines, table = _describe(pool), np.concatenate([cell_table(grid) for grid in pool])
+    widths = sorted({grid.cols for grid in pool})
+    lines, strides = _describe(pool, widths), np.concatenate([strides_of(cols) for cols in widths])
+    opened = np.concatenate([open_actions(grid) for grid in pool])
     home = np.concatenate([grid.home for grid in pool])
-    for array in (lines, table, home):
+    for array in (lines, opened, strides, home):
         array.flags.writeable = False
     return World(
         n_agents,
@@ -61,21 +65,25 @@ def make_world(
         int(return_home),
         distances_at,
         paths_at,
+        0,
+        0,
+        0,
         lines,
-        table,
+        opened,
+        strides,
         home,
         distances,
         paths,
     )
 
 
-def _describe(grids: Sequence[Grid]) -> NDArray[np.int64]:
-    """Return a line of numbers for each grid, see ``state.FIRST`` to ``RECIPROCAL``, (G, 7)."""
-    sizes = [grid.n_cells for grid in grids]
-    firsts = np.cumsum([0, *sizes[:-1]]).tolist()
-    width = max(grid.cols for grid in grids)
-    lines = [
-        (first, size, grid.depot, grid.rows, grid.cols, width, -(-(1 << SHIFT) // grid.cols))
-        for first, size, grid in zip(firsts, sizes, grids, strict=True)
-    ]
+def _describe(grids: Sequence[Grid], widths: Sequence[int]) -> NDArray[np.int64]:
+    """Return a line of numbers for each grid, see ``state.FIRST`` to ``STRIDES``, (G, 8)."""
+    places = {cols: WAYS * place for place, cols in enumerate(widths)}
+    lines, first = [], 0
+    for grid in grids:
+        reciprocal = -(-(1 << SHIFT) // grid.cols)
+        size = grid.rows, grid.cols, widths[-1]
+        lines.append((first, grid.n_cells, grid.depot, *size, reciprocal, places[grid.cols]))
+        first += grid.n_cells
     return np.array(lines, np.int64)

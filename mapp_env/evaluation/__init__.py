@@ -54,10 +54,12 @@ def evaluate(
     objective : {"cover_time", "makespan", "total_distance"}, optional
         What ``cost`` is: the cover time unless said otherwise; with ``return_home``, where the
         team has to be home as well, the makespan.
-    grid : str, path or Grid, optional
-        Of landmark cells; problems bring their own.
+    grid : str, path, Grid or sequence of Grid, optional
+        Of landmark cells, their grid. Problems bring theirs; with them it may be a pool to which
+        all of these belong, for policies whose observations depend on the whole pool: ``planes``
+        are as large as its largest grid.
     n_agents : int, optional
-        The same: 3, unless said otherwise.
+        With landmark cells: 3, unless said otherwise.
     max_cycles : int, optional
         Step limit of all episodes. By default each problem's own or, if it has none, as many steps
         as a single agent may need that walks from each landmark to the next: 2 K times the
@@ -67,8 +69,8 @@ def evaluate(
     **env_arguments
         Arguments of the environment, as :func:`mapp_env.make_vec` takes them: ``observation``,
         ``actions``, ``return_home``, ``allow_wait``, ``reward``. Problems of several grids are
-        played as a pool, but with ``observation="planes"`` only those whose grids have the same
-        sides, so that planes are as large as the grid.
+        played as a pool; with ``observation="planes"`` only those whose grids have the same sides,
+        so that planes are as large as the grid, unless there is a ``grid`` pool.
 
     Returns
     -------

@@ -67,8 +67,8 @@ def play_episodes(
 
     Raises a ValueError if an argument is invalid, the policy is of another grid, or it fails.
     """
-    for grid in group.grids:
-        check_grid(policy, grid)
+    for number in np.unique(group.which):
+        check_grid(policy, group.grids[number])
     (n_problems, n_landmarks), n_agents = group.landmarks.shape, group.n_agents
     longest = int(group.limits.max())
     sizes = {"n_agents": n_agents, "n_landmarks": n_landmarks, "max_cycles": longest}

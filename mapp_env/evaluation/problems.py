@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.grid import Grid
-from mapp_env.grids import find_grid
+from mapp_env.grids import find_grid, find_grids
 from mapp_env.problem import MAX_AGENTS, MAX_CYCLES, Problem, check_landmarks
 from mapp_env.validation import as_array, check_count, describe
 
@@ -97,34 +97,39 @@ def group_rows(
 
 
 def group_problems(
-    problems: Sequence[Problem], limits: Sequence[int], by_shape: bool = False
+    problems: Sequence[Problem],
+    limits: Sequence[int],
+    by_shape: bool = False,
+    pool: Sequence[Grid] = (),
 ) -> list[Group]:
     """Return problems of any grids and sizes in groups of equal N and K, the first one's first.
 
-    ``limits`` are their step limits; ``by_shape`` keeps grids of different sides apart.
+    ``limits`` are their step limits; ``by_shape`` keeps grids of different sides apart. A ``pool``
+    that holds all their grids is that of each group; without it each has its own problems' grids.
     """
     alike: dict[tuple[object, ...], list[int]] = {}
     for place, problem in enumerate(problems):
-        shape = problem.grid.walls.shape if by_shape else None
+        shape = problem.grid.walls.shape if by_shape and not pool else None
         alike.setdefault((problem.n_agents, len(problem.landmarks), shape), []).append(place)
     groups = []
     for places in alike.values():
-        pool: dict[Grid, int] = {}
+        grids = dict.fromkeys(pool)
         room, first = MAX_POOL_CELLS, 0
         for last, place in enumerate(places):
             grid = problems[place].grid
-            if grid not in pool and pool and grid.n_cells > room:
-                groups.append(_group(problems, limits, places[first:last]))
-                pool, room, first = {}, MAX_POOL_CELLS, last
-            if grid not in pool:
-                pool[grid] = len(pool)
+            if grid not in grids and grids and grid.n_cells > room:
+                groups.append(_group(problems, limits, places[first:last], list(grids)))
+                grids, room, first = {}, MAX_POOL_CELLS, last
+            if grid not in grids:
+                grids[grid] = None
                 room -= grid.n_cells
-        groups.append(_group(problems, limits, places[first:]))
+        groups.append(_group(problems, limits, places[first:], list(grids)))
     return groups
 
 
-def _group(problems: Sequence[Problem], limits: Sequence[int], places: list[int]) -> Group:
-    grids = list(dict.fromkeys(problems[place].grid for place in places))
+def _group(
+    problems: Sequence[Problem], limits: Sequence[int], places: list[int], grids: list[Grid]
+) -> Group:
     numbers = {grid: number for number, grid in enumerate(grids)}
     return Group(
         np.array(places),
@@ -154,21 +159,31 @@ def read_groups(
         check_count("max_cycles", max_cycles, 1, MAX_CYCLES)
     found = read_problems(problems)
     if found is None:
-        rows, whole = _read_rows(problems, grid)
+        rows, own = _read_rows(problems, grid)
         agents = DEFAULT_AGENTS if n_agents is None else n_agents
         check_count("n_agents", agents, 1, MAX_AGENTS)
-        limit = max_cycles or enough_steps(whole, rows.shape[1], return_home)
-        return [group_rows(whole, rows, agents, limit)]
-    for name, value in (("grid", grid), ("n_agents", n_agents)):
-        if value is not None:
+        limit = max_cycles or enough_steps(own, rows.shape[1], return_home)
+        return [group_rows(own, rows, agents, limit)]
+    if n_agents is not None:
+        raise ValueError(
+            f"n_agents must be left out with problems that bring theirs, got {describe(n_agents)}"
+        )
+    pool: tuple[Grid, ...] = ()
+    if grid is not None:
+        whole = find_grids(grid)
+        pool = whole if isinstance(whole, tuple) else (whole,)
+    known = set(pool)
+    for place, problem in enumerate(found if pool else []):
+        if problem.grid not in known:
             raise ValueError(
-                f"{name} must be left out with problems that bring their own, got {describe(value)}"
+                f"problems[{place}] must be on a grid of grid=, which has {len(pool)}, got "
+                f"{problem!r}"
             )
     limits = [
         max_cycles or each.max_cycles or enough_steps(each.grid, len(each.landmarks), return_home)
         for each in found
     ]
-    return group_problems(found, limits, by_shape)
+    return group_problems(found, limits, by_shape, pool)
 
 
 def read_problems(problems: object) -> list[Problem] | None:

@@ -216,7 +216,7 @@ def _draw_legend(
     entries.append(Line2D([], [], color=ink, linewidth=1.6, linestyle=DASHES, label="way home"))
     entries.append(Patch(label="not visited", **NOT_VISITED) if some_unvisited else nothing)
     if lost is not None:
-        label = f"{sum(step > 0 for step in lost)} decisions lost {sum(lost)} steps"
+        label = f"steps lost: {sum(lost)}, in {sum(step > 0 for step in lost)} of {len(lost)}"
         entries += [Line2D([], [], color=to_hex(LOST), linewidth=8, label=label), nothing, nothing]
     # Matplotlib fills column by column; people read row by row.
     by_column = [entry for col in range(LEGEND_COLUMNS) for entry in entries[col::LEGEND_COLUMNS]]

@@ -66,8 +66,8 @@ def optimal_costs(
     objective : {"cover_time", "makespan", "total_distance"}
         What is minimised.
     starts : array_like of int, shape (P, N), optional
-        Where each problem's agents stand at first, cells as of ``Problem(starts=...)``; without it
-        all start on the depot, which is faster.
+        Where each problem's agents stand at first: reachable cells or the depot, none of them a
+        landmark of its row. Without it all start on the depot, which is faster.
 
     Returns
     -------

@@ -258,10 +258,10 @@ def test_pictures_mark_lost_steps(
     assert before.shape != after.shape or (before != after).any()
     assert main([*options, "--show-regret"]) == 0
     steps = ", ".join(f"{step + 1} ({lost[step]})" for step in np.flatnonzero(lost))
-    assert f"{lost.sum()} steps lost, by step: {steps}\n" in capsys.readouterr().out
+    assert f"steps lost: {lost.sum()}, by step: {steps}\n" in capsys.readouterr().out
 
 
 def test_an_optimum_loses_nothing(capsys: pytest.CaptureFixture[str], loader: str) -> None:
     """The solver's own plan, drawn so, says that no step lost any."""
     assert main(["render", "--landmarks", *CELLS, "--out", "a.png", "--show-regret"]) == 0
-    assert "0 steps lost, by step: none" in capsys.readouterr().out
+    assert "steps lost: 0, by step: none" in capsys.readouterr().out

@@ -213,6 +213,33 @@ def test_little_room_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch)
     equal(evaluate(policy, given, **options), whole)
 
 
+def test_a_pool_decides_how_large_planes_are() -> None:
+    """Of a pool that is given, planes are as large as its largest grid; else as their own."""
+    given = mixed_problems((2,))
+    sides: set[tuple[int, ...]] = set()
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        sides.add(seen.shape[-2:])
+        return Hashing().act(seen)
+
+    pool = [*{problem.grid: None for problem in given}, make_grid("maze", rows=12, cols=9)]
+    options = {"observation": "planes", "max_cycles": 5}
+    evaluate(act, given, **options)
+    assert sides == {problem.grid.walls.shape for problem in given}
+    assert len(sides) > 1
+    sides.clear()
+    together = evaluate(act, given, grid=pool, **options)
+    assert sides == {(12, 9)}
+    alone = [evaluate(act, [problem], grid=pool, **options)["steps"][0] for problem in given]
+    assert together["steps"].tolist() == alone
+    for kind in ("geodesic", "distances"):
+        options = {"observation": kind, "max_cycles": 20}
+        equal(
+            evaluate(Hashing(), given, grid=pool, **options),
+            evaluate(Hashing(), given, **options),
+        )
+
+
 # -- what is proven ----------------------------------------------------------------------------
 
 
@@ -338,7 +365,8 @@ def test_a_policy_is_refused_before_anything_is_played() -> None:
         ({"problems": [[0.5]], "grid": PAPER}, "problems must be mapp_env.Problems"),
         ({"problems": [[0], [1, 2]], "grid": PAPER}, "problems must be mapp_env.Problems"),
         ({"problems": [[0]], "grid": "nowhere"}, "grid must be"),
-        ({"problems": [Problem(PAPER, [0])], "grid": PAPER}, "grid must be left out"),
+        ({"problems": [Problem(PAPER, [0])], "grid": [OTHER]}, r"problems\[0\] must be on a grid"),
+        ({"problems": [Problem(PAPER, [0])], "grid": []}, "grid must be a grid, or a sequence"),
         ({"problems": [Problem(PAPER, [0])], "n_agents": 3}, "n_agents must be left out"),
         ({"problems": [Problem(PAPER, [0]), [1]]}, "problems must be mapp_env.Problems"),
         ({"n_agents": 17}, "n_agents must be"),

@@ -165,6 +165,22 @@ def test_the_optimum_of_walking_home_is_that_of_a_search(allow_wait: bool) -> No
     assert missed > 0  # distances of idle agents, and odd ways without a rest
 
 
+@pytest.mark.parametrize("allow_wait", [True, False])
+def test_who_cannot_rest_may_be_late(allow_wait: bool) -> None:
+    """Far from all walls an agent one step from home is not there at an even time, unless it waits.
+
+    Then no optimum is claimed, but where the policy itself meets the bound.
+    """
+    grid = Grid(np.zeros((7, 7), np.bool_))
+    problem = Problem(grid, [22], 2, starts=(24, 25))
+    least = least_home(problem, allow_wait)["makespan"]
+    (group,) = problems.group_problems([problem], [30])
+    proven = optima.proven_costs(group, "makespan", True, allow_wait)
+    assert proven.bound[0] == 4
+    assert least == (4 if allow_wait else 6)
+    np.testing.assert_array_equal(proven.optimum, [4 if allow_wait else np.nan])
+
+
 def test_all_home_is_judged_by_the_makespan() -> None:
     """With return_home the cost is the makespan that was walked, and so is the optimum."""
     line = Grid.from_text("D....")

@@ -120,24 +120,29 @@ def test_landmarks_are_walked_to(path: Path) -> None:
 
 
 @each_map
-def test_the_map_is_solved(path: Path) -> None:
+@pytest.mark.parametrize("anywhere", [False, True], ids=["depot", "anywhere"])
+def test_the_map_is_solved(path: Path, anywhere: bool) -> None:
     """The solver's plan is valid, and played through the environment it costs what it says."""
     grid = Grid.load(path)
-    problem = Problem(grid, landmarks_of(grid), N_AGENTS)
-    plan = solve(problem, method="search", time_limit=0.2)
-    plan.verify(problem)
+    cells = sample_problems(grid, 1, N_LANDMARKS + N_AGENTS, seed=7)[0]
+    cells = np.random.default_rng(7).permutation(cells).tolist()
+    starts = cells[N_LANDMARKS:] if anywhere else None
+    problem = Problem(grid, cells[:N_LANDMARKS], N_AGENTS, starts=starts)
+    nearest = grid.distances_from(sorted(set(problem.start_cells))).min(axis=0)
     best = solve(problem)
-    best.verify(problem)
-    assert grid.home[list(problem.landmarks)].max() <= best.cost <= plan.cost
-    for each in (plan, best):
+    found = solve(problem, method="search", time_limit=0.2)
+    assert best.status == "optimal"
+    assert nearest[list(problem.landmarks)].max() <= best.cost <= found.cost
+    for plan in (best, found):
+        plan.verify(problem)
         env = mapp_v0.parallel_env(
-            grid=grid, n_agents=N_AGENTS, n_landmarks=N_LANDMARKS, max_cycles=int(each.cost)
+            grid=grid, n_agents=N_AGENTS, n_landmarks=N_LANDMARKS, max_cycles=int(plan.cost)
         )
-        env.reset(options={"landmarks": problem.landmarks})
-        for joint in each.joint_actions().tolist():
+        env.reset(options={"problem": problem})
+        for joint in plan.joint_actions().tolist():
             _, _, _, _, infos = env.step(dict(zip(env.agents, joint, strict=True)))
         assert not env.agents
-        assert infos["agent_0"]["metrics"]["cover_time"] == each.cost
+        assert infos["agent_0"]["metrics"]["cover_time"] == plan.cost
 
 
 @pytest.mark.parametrize("actions", ["moves", "landmarks"])

@@ -257,7 +257,7 @@ SMALL = {
         ({"n_actions": 3}, r"^n_actions must be .* got 3"),
         ({"n_actions": 6}, r"^n_actions must be .* got 6"),
         ({"n_cells": 1}, r"^n_cells must be .* got 1"),
-        ({"n_cells": 512 * 512 + 1}, r"^n_cells must be .* got 262145"),
+        ({"n_cells": 2048 * 2048 + 1}, r"^n_cells must be .* got 4194305"),
         ({"hidden_units": 4097}, r"^hidden_units must be .* got 4097"),
         ({"kind": "pairs", "code_units": 0}, r"^code_units must be .* got 0"),
         ({"kind": "pairs", "code_units": 2.0}, r"^code_units must be .* got 2\.0"),

@@ -209,12 +209,13 @@ PLAN = solve(PROBLEM)
 
 
 def test_tours_begin_at_the_agents_own_start() -> None:
-    """A tour from the depot, or from the other agent's start, is refused, as is one that ends."""
+    """A tour from elsewhere, even the depot or the other start, or without its end is refused."""
     assert [tour[0] for tour in PLAN.tours] == [3, 8]
     for tours in (
         PLAN.tours[::-1],
         (PLAN.tours[0][1:], PLAN.tours[1]),
         (PLAN.tours[0][:-1], PLAN.tours[1]),
+        ((5, 1, 0, 1, 5), PLAN.tours[1]),
     ):
         with pytest.raises(ValueError, match="must start at cell 3 and end at the depot, cell 5"):
             dataclasses.replace(PLAN, tours=tours).verify()

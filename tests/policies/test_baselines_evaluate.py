@@ -4,11 +4,13 @@ import dataclasses
 import importlib.util
 import itertools
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import mapp_env
 from baselines import evaluate as script
 from baselines.networks import build_network, network_spec
 from baselines.policies import evaluation as evaluation_module
@@ -19,6 +21,7 @@ from baselines.policies.evaluation import (
     find_optima,
     format_table,
     play,
+    regret_lines,
     save_table,
     unseen_problems,
 )
@@ -32,6 +35,7 @@ from baselines.policies.rules_of_thumb import (
 )
 from baselines.policies.settings import Setting
 from mapp_env import Grid, Problem, make_grid, replay, solve
+from mapp_env.evaluation.summary import losses_line, summarise
 
 PAPER = Setting(make_grid("paper-7x7"))
 WIDE = Setting(Grid.from_text("D......#\n.##.#...\n...#...."), 2, 3, 30)
@@ -335,6 +339,54 @@ def test_no_optima_no_gaps():
         [result.summary()[name] for name in ("gap %", "optimal %", "worst gap %")]
     ).all()
     assert len(format_table({"nearest": result}).splitlines()) == 3
+
+
+def test_regrets_are_those_of_the_packages_evaluation(monkeypatch, capsys):
+    """The lines below the table tell what mapp_env.evaluate finds; of many problems a sample does.
+
+    Without optima there are none.
+    """
+    problems = unseen_problems(PAPER, 60)
+    optima = find_optima(PAPER, problems)
+    policy = rivals(PAPER)[1]
+    table = {"nearest": evaluate(policy, PAPER, problems, optima)}
+    found = mapp_env.evaluate(policy, problems, grid=PAPER.grid, max_cycles=PAPER.max_cycles)
+    figures = summarise(found)
+    assert figures["regret"] > 0
+    assert regret_lines(table) == [f"nearest: {losses_line(figures)}"]
+    for name in ("cover_time", "steps"):
+        np.testing.assert_array_equal(getattr(table["nearest"], name), found[name])
+    np.testing.assert_array_equal(table["nearest"].gaps, found["gap"])
+    monkeypatch.setattr(evaluation_module, "MAX_JUDGED", 25)
+    part = summarise({name: values[::3] for name, values in found.items()})
+    assert regret_lines(table) == [
+        "regrets are those of 20 problems, spread evenly among all",
+        f"nearest: {losses_line(part)}",
+    ]
+    assert regret_lines({"nearest": evaluate(policy, PAPER, problems)}) == []
+    script.main(script.Args("nearest", 20))
+    printed = capsys.readouterr().out
+    for label in ("nearest landmark", "earliest arrival"):
+        assert re.search(rf"^{label}: regret 0\.\d+ steps a decision: first dec", printed, re.M)
+
+
+def test_playing_starts_anywhere():
+    """Problems of several grids, sizes and starts: each plan is its own problem's."""
+    rng = np.random.default_rng(0)
+    problems = []
+    for setting in (PAPER, WIDE, PAPER):
+        row = unseen_problems(setting, 1, seed=len(problems))[0].tolist()
+        free = [cell for cell in setting.grid.reachable.tolist() if cell not in row]
+        starts = rng.choice(free, setting.n_agents).tolist()
+        problems.append(Problem(setting.grid, row, setting.n_agents, starts=starts))
+
+    class Anywhere:
+        def act(self, observations):
+            n_agents = {13: 3, 8: 2}[observations.shape[1]]
+            return rng.integers(4, size=(len(observations), n_agents))
+
+    for problem, plan in zip(problems, play(Anywhere(), problems), strict=True):
+        plan.verify(problem)
 
 
 def test_cost_below_the_optimum_is_an_error():

@@ -96,7 +96,7 @@ def test_a_figure_marks_all_agents_moves() -> None:
     ]
     assert sorted(lines_of(ax)) == sorted(expected)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert "3 decisions lost 4 steps" in texts
+    assert "steps lost: 4, in 3 of 7" in texts
     assert lines_of(draw_plan(PROBLEM, PLAN)) == []
     plain = [text.get_text() for text in draw_plan(PROBLEM, PLAN).get_legend().get_texts()]
     assert not any("lost" in text for text in plain)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapp_env import Plan, Problem, make_grid, sample_problems, solve
+from mapp_env import Plan, Problem, make_grid, sample_problems, solve, solvers
 from mapp_env.solvers import _plan_of, solve_many
 from mapp_env.solvers.search import solve_search
 
@@ -118,6 +118,21 @@ def test_the_bound_leaves_time_for_the_search() -> None:
         assert short.bound == farthest
         assert longer.bound is not None
         assert farthest < longer.bound <= longer.cost
+
+
+def test_a_plan_is_made_within_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a problem took beyond its limit the next search leaves, but never more than half."""
+    problem = Problem(make_grid(), (0, 6), 2)
+    plan, limits = solve(problem), []
+    seconds = iter([1.2, 0.9, 5.0, 0.1, 1.0])
+
+    def timed(*arguments: object, **_: object) -> Plan:
+        limits.append(arguments[3])
+        return replace(plan, seconds=next(seconds))
+
+    monkeypatch.setattr(solvers, "_solve", timed)
+    assert len(solve_many([problem] * 5, time_limit=1.0)) == 5
+    assert limits == pytest.approx([1.0, 0.8, 0.9, 0.5, 1.0])
 
 
 def test_nothing_to_solve() -> None:

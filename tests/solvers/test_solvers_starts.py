@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapp_env import Grid, Problem
+from mapp_env import Grid, Problem, solve
 from mapp_env.engine.rules import measure_row, reset_row, step_row
 from mapp_env.engine.state import State, new_rows, split
 from mapp_env.engine.world import make_world
@@ -147,6 +147,18 @@ def test_exact_is_brute_force(seed: int) -> None:
             distances = problem_distances(problem)
             assert lower_bound(problem, objective, distances) == best[0]
             assert tree_bound(distances, objective) <= best[0]
+
+
+def test_plans_cost_what_is_proven() -> None:
+    """Walked by the rules, the routes cost the optimum and have the least distance, idle or not."""
+    rng = np.random.default_rng(30)
+    for _ in range(100):
+        problem = random_problem(rng, 5, 4)
+        for objective, best in brute_force(problem).items():
+            plan = solve(problem, objective, "exact")
+            assert (plan.cost, plan.total_distance) == best, (problem, objective)
+            assert (plan.status, plan.bound) == ("optimal", plan.cost)
+            plan.verify(problem)
 
 
 @pytest.mark.parametrize(("landmarks", "agents"), [(6, 6), (7, 2), (7, 3)])
