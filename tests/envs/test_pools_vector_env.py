@@ -343,3 +343,16 @@ def test_large_batches_and_pools() -> None:
             assert cells[row, :2].tolist() == wanted
         ended = terminations | truncations
     assert len(set(infos["grid"].tolist())) > 500
+
+
+def test_of_equal_grids_a_problem_takes_the_first() -> None:
+    """A pool may hold a grid twice: a problem on it is on the first, a number means its own."""
+    twice = [POOL[1], POOL[0], mapp_env.Grid.from_text("\n".join(POOL_ROWS[0]) + "\n")]
+    problem = mapp_env.Problem(twice[2], (0, 1, 2), 2)
+    env = mapp_v0.parallel_env(**settings(grid=twice))
+    assert env.reset(options={"problem": problem})[1]["agent_0"]["grid"] == 1
+    assert env.reset(options={"grid": 2})[1]["agent_0"]["grid"] == 2
+    envs = mapp_env.make_vec(2, **settings(grid=twice))
+    assert envs.reset(options={"problem": [problem] * 2})[1]["grid"].tolist() == [1, 1]
+    assert envs.reset(options={"grid": [2, 1]})[1]["grid"].tolist() == [2, 1]
+    assert {env.reset(seed=seed)[1]["agent_0"]["grid"] for seed in range(30)} == {0, 1, 2}
