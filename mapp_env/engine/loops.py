@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
 from mapp_env.engine.observation import observe_row
-from mapp_env.engine.rules import measure_row, reset_row, step_row, visit_row
+from mapp_env.engine.rules import (
+    measure_row,
+    move_row,
+    reset_row,
+    settle_row,
+    step_row,
+    visit_row,
+)
 from mapp_env.engine.state import (
     N_CELLS,
     Packed,
@@ -73,37 +80,32 @@ def step_rows(
     Shapes: (B, ...) of what ``step_row`` and ``observe_row`` take.
     """
     common = unpack(world)
-    out = rewards, terminations, truncations, views, masks
     if is_plain(common):
         for index in range(rows.shape[0]):
-            own = world_at(common, rows[index], index, True)
-            _step_at(index, rows, actions, skip, limits, out, own)
-    else:
-        for index in range(rows.shape[0]):
+            own, row = world_at(common, rows[index], index, True), rows[index]
+            if skip[index]:
+                rewards[index], terminations[index], truncations[index] = 0.0, False, False
+            else:
+                rewards[index], terminations[index], truncations[index] = step_row(
+                    row, actions[index], limits[index], own
+                )
+            observe_row(row, own, views[index], masks[index])
+        return
+    # All rows move before the first is observed: what is looked up for them in tables too large for
+    # the cache is waited for together.
+    for index in range(rows.shape[0]):
+        if not skip[index]:
             own = world_at(common, rows[index], index)
-            _step_at(index, rows, actions, skip, limits, out, own)
-
-
-@kernel
-def _step_at(
-    index: int,
-    rows: Int32s,
-    actions: Int64s,
-    skip: Bools,
-    limits: Int64s,
-    out: tuple[Float64s, Bools, Bools, Float32s, Int8s],
-    world: World,
-) -> None:
-    rewards, terminations, truncations, views, masks = out
-    if skip[index]:
-        rewards[index] = 0.0
-        terminations[index] = False
-        truncations[index] = False
-    else:
-        rewards[index], terminations[index], truncations[index] = step_row(
-            rows[index], actions[index], limits[index], world
-        )
-    observe_row(rows[index], world, views[index], masks[index])
+            move_row(split_row(rows[index], own.n_agents, own.n_landmarks), actions[index], own)
+    for index in range(rows.shape[0]):
+        own, row = world_at(common, rows[index], index), rows[index]
+        if skip[index]:
+            rewards[index], terminations[index], truncations[index] = 0.0, False, False
+        else:
+            rewards[index], terminations[index], truncations[index] = settle_row(
+                split_row(row, own.n_agents, own.n_landmarks), limits[index], own
+            )
+        observe_row(row, own, views[index], masks[index])
 
 
 @kernel

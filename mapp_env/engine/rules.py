@@ -17,7 +17,7 @@ from mapp_env.engine.state import (
     ALL_PAIRS,
     COORDINATES,
     DEPOT,
-    LANDMARKS,
+    MOVES,
     N_ACTIONS,
     NO_DISTANCES,
     WAIT,
@@ -96,6 +96,12 @@ def step_row(
     """
     state = split_row(row, world.n_agents, world.n_landmarks)
     move_row(state, actions, world)
+    return settle_row(state, max_cycles, world)  # type: ignore[no-any-return]
+
+
+@kernel
+def settle_row(state: State, max_cycles: int, world: World) -> tuple[float, bool, bool]:
+    """Do what comes after the move (R5 to R7); return what ``step_row`` does."""
     reward, terminated = visit_row(state, world)
     return reward, terminated, bool(not terminated and state.step[0] >= max_cycles)
 
@@ -104,14 +110,22 @@ def step_row(
 def move_row(state: State, actions: NDArray[np.int64], world: World) -> None:
     """Move all agents at once (R3, R4, R11)."""
     state.step[0] += 1
-    for agent in range(world.n_agents):
-        cell = state.cells[agent]
-        move = actions[agent]
-        if world.actions == LANDMARKS:
-            move = _move_towards(state, world, cell, move)
-        to = next_cell(world, cell, move)
-        state.cells[agent] = to
-        state.moved[agent] += to != cell
+    # A loop for each kind of action: to ask within one would take a tenth of a batched step.
+    if world.actions == MOVES:
+        for agent in range(world.n_agents):
+            _move_agent(state, world, agent, actions[agent])
+    else:
+        for agent in range(world.n_agents):
+            move = _move_towards(state, world, state.cells[agent], actions[agent])
+            _move_agent(state, world, agent, move)
+
+
+@kernel
+def _move_agent(state: State, world: World, agent: int, move: int) -> None:
+    cell = state.cells[agent]
+    to = next_cell(world, cell, move)
+    state.cells[agent] = to
+    state.moved[agent] += to != cell
 
 
 @kernel

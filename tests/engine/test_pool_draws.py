@@ -21,7 +21,7 @@ POOL = (
     ("...#.", ".D.#.", "..###"),
     ("..", ".D", "..", "#."),
 )
-N_ROWS = 20_000
+N_ROWS = 10_000
 
 
 def chi_square(counts: Any, expected: Any) -> float:
@@ -42,7 +42,7 @@ def draws(n_landmarks: int, how: str) -> tuple[np.ndarray, np.ndarray]:
     settings: dict[str, Any] = {"grid": the_pool(), "n_agents": 1, "n_landmarks": n_landmarks}
     if how == "one row":
         env = mapp_v0.parallel_env(**settings)
-        infos = [env.reset(seed=5 if i == 0 else None)[1] for i in range(4000)]
+        infos = [env.reset(seed=5 if i == 0 else None)[1] for i in range(2000)]
         env.reset(seed=5)
         cells = []
         for _ in infos:
@@ -77,11 +77,11 @@ def test_draws_are_uniform(n_landmarks: int, how: str) -> None:
 def test_sizes_of_pools_are_uniform(n_grids: int) -> None:
     """Also of many grids each is as likely, the first and the last not less than others."""
     grid = mapp_env.Grid.from_text("D..\n")
-    envs = mapp_env.make_vec(40_000, grid=[grid] * n_grids, n_agents=1, n_landmarks=1)
+    envs = mapp_env.make_vec(15_000, grid=[grid] * n_grids, n_agents=1, n_landmarks=1)
     _, infos = envs.reset(seed=7)
     counts = np.bincount(infos["grid"], minlength=n_grids)
     assert len(counts) == n_grids
-    assert abs(chi_square(counts, np.full(n_grids, 40_000 / n_grids))) < 6
+    assert abs(chi_square(counts, np.full(n_grids, 15_000 / n_grids))) < 6
 
 
 def test_rows_and_episodes_are_independent() -> None:
