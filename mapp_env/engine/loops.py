@@ -23,7 +23,6 @@ from mapp_env.engine.state import (
     N_CELLS,
     Packed,
     World,
-    is_plain,
     new_rows,
     pack,
     split,
@@ -63,7 +62,7 @@ def step_and_observe(
 
 
 @kernel
-def step_rows(
+def step_and_observe_rows(
     rows: Int32s,
     actions: Int64s,
     skip: Bools,
@@ -75,37 +74,52 @@ def step_rows(
     masks: Int8s,
     world: Packed,
 ) -> None:
-    """Step all rows but those of ``skip``, with checked actions; observe all.
+    """Step all rows but those of ``skip``, with checked actions, in a plain world; observe all.
 
     Shapes: (B, ...) of what ``step_row`` and ``observe_row`` take.
     """
     common = unpack(world)
-    if is_plain(common):
-        for index in range(rows.shape[0]):
-            own, row = world_at(common, rows[index], index, True), rows[index]
-            if skip[index]:
-                rewards[index], terminations[index], truncations[index] = 0.0, False, False
-            else:
-                rewards[index], terminations[index], truncations[index] = step_row(
-                    row, actions[index], limits[index], own
-                )
-            observe_row(row, own, views[index], masks[index])
-        return
-    # All rows move before the first is observed: what is looked up for them in tables too large for
-    # the cache is waited for together.
+    for index in range(rows.shape[0]):
+        own, row = world_at(common, rows[index], index, True), rows[index]
+        if skip[index]:
+            rewards[index], terminations[index], truncations[index] = 0.0, False, False
+        else:
+            rewards[index], terminations[index], truncations[index] = step_row(
+                row, actions[index], limits[index], own
+            )
+        observe_row(row, own, views[index], masks[index])
+
+
+@kernel
+def step_rows(
+    rows: Int32s,
+    actions: Int64s,
+    skip: Bools,
+    limits: Int64s,
+    rewards: Float64s,
+    terminations: Bools,
+    truncations: Bools,
+    world: Packed,
+) -> None:
+    """Step all rows but those of ``skip``, with checked actions, in any world.
+
+    Shapes: (B, ...) of what ``step_row`` takes.
+    """
+    common = unpack(world)
+    # All rows move before the first is looked at again: what is looked up for them in tables too
+    # large for the cache is waited for together.
     for index in range(rows.shape[0]):
         if not skip[index]:
             own = world_at(common, rows[index], index)
             move_row(split_row(rows[index], own.n_agents, own.n_landmarks), actions[index], own)
     for index in range(rows.shape[0]):
-        own, row = world_at(common, rows[index], index), rows[index]
         if skip[index]:
             rewards[index], terminations[index], truncations[index] = 0.0, False, False
         else:
+            own = world_at(common, rows[index], index)
             rewards[index], terminations[index], truncations[index] = settle_row(
-                split_row(row, own.n_agents, own.n_landmarks), limits[index], own
+                split_row(rows[index], own.n_agents, own.n_landmarks), limits[index], own
             )
-        observe_row(row, own, views[index], masks[index])
 
 
 @kernel

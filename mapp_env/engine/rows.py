@@ -14,11 +14,12 @@ from mapp_env.engine.loops import (
     measure_rows,
     observe_rows,
     reset_rows,
+    step_and_observe_rows,
     step_rows,
 )
 from mapp_env.engine.scene import TRAIL_MOVES, Scene
 from mapp_env.engine.sources import Problems
-from mapp_env.engine.state import new_rows, pack, split
+from mapp_env.engine.state import is_plain, new_rows, pack, split
 from mapp_env.engine.task import Task
 from mapp_env.problem import MAX_CYCLES
 
@@ -53,7 +54,8 @@ class Rows:
     def _bind(self) -> None:
         """Gather what is read at every step: for a single row, to look it up would take longer."""
         self.state = split(self.array, self.task.n_agents, self.task.n_landmarks)
-        self.world = pack(self.task.world(self._fields))
+        world = self.task.world(self._fields)
+        self.world, self._plain = pack(world), is_plain(world)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore a copy; what the kernels read must be views of it, not copies of views."""
@@ -125,7 +127,12 @@ class Rows:
         views = np.empty((self.n_rows, *self.views_shape), np.float32)
         masks = np.empty((self.n_rows, *self.masks_shape), np.int8)
         found = rewards, terminations, truncations, views, masks
-        step_rows(self.array, actions, skip, self.limits, *found, self.world)
+        given = self.array, actions, skip, self.limits
+        if self._plain:
+            step_and_observe_rows(*given, *found, self.world)
+        else:
+            step_rows(*given, *found[:3], self.world)
+            self.observe_again(self._every_row, views, masks)
         if self._trails is not None:
             self.extend_trails(np.flatnonzero(~skip))
         return found

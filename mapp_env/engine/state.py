@@ -161,10 +161,9 @@ split_row = kernel(split)
 """The same within kernels, of one row."""
 
 
-@kernel
 def is_plain(world: World) -> bool:
     """Return whether a world has one grid and neither R11 nor R12: the game of the paper."""
-    return world.grids.shape[0] == 1 and world.actions == MOVES and world.return_home == 0
+    return len(world.grids) == 1 and world.actions == MOVES and not world.return_home
 
 
 @kernel

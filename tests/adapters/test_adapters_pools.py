@@ -218,7 +218,10 @@ def test_copies_continue_identically(form: str, copier: str, same: Any) -> None:
     same(first, play(envs))
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    "form",
+    [pytest.param(form, marks=[] if form == "landmarks" else [pytest.mark.slow]) for form in FORMS],
+)
 def test_trainers_run(form: str) -> None:
     """PPO, and DQN where joint actions are numbered, train some steps on a pool."""
     settings = {**SETTINGS, **FORMS[form]}

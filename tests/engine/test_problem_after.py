@@ -13,7 +13,7 @@ from model_pools import Game, random_game, random_landmarks, random_starts
 import mapp_env
 from mapp_env import mapp_v0
 
-GAMES = range(40)
+GAMES = range(16)
 
 
 def played(seed: int, limit: int | None) -> tuple[Game, mapp_env.Problem, list[Any]]:
