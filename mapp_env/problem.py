@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mapp_env.compiled import kernel
+from mapp_env.draws import draw_landmarks
 from mapp_env.engine.rules import reset_row, step_row
 from mapp_env.engine.state import WAIT, new_rows, split
 from mapp_env.engine.world import make_world
@@ -26,8 +26,6 @@ MAX_LANDMARKS = 256
 MAX_CYCLES = 1_000_000
 
 MAX_LISTED = 1_000_000  # problems of a grid that are listed to draw from; beyond, by rejection
-
-LOW_32_BITS = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -354,58 +352,3 @@ def sample_problems(
         taken.add(landmarks)
         row[:] = drawn
     return problems
-
-
-@kernel
-def draw_landmarks(word: np.uint64, candidates: NDArray[np.int32], out: NDArray[np.int32]) -> None:
-    """Choose distinct ones of ascending cells, every set equally likely, by one random word.
-
-    Floyd's sampling (Bentley and Floyd 1987, doi:10.1145/30401.315746), then sorted: landmarks are
-    a set, and a set should have one observation, not ``K!``. One word an episode lets each row of
-    a batch draw from its own ``numpy.random.Generator`` without calling it from compiled code.
-    """
-    high = np.int64(word >> np.uint64(32))
-    low = np.int64(word & np.uint64(LOW_32_BITS))
-    count = out.shape[0]
-    first = candidates.shape[0] - count
-    used = 0
-    for chosen in range(count):
-        last = first + chosen
-        # Uniform in 0..last: of the 2**32 values of `bits`, those past the last full multiple of
-        # the range are drawn again.
-        span = last + 1
-        pick, multiple = 0, LOW_32_BITS
-        while multiple > LOW_32_BITS + 1 - span:
-            bits = scramble(scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
-            used += 1
-            pick = bits % span
-            multiple = bits - pick
-        for earlier in range(chosen):
-            if out[earlier] == pick:
-                pick = last
-        # `out` holds ranks, ascending, until the end.
-        place = chosen
-        while place > 0 and out[place - 1] > pick:
-            out[place] = out[place - 1]
-            place -= 1
-        out[place] = pick
-    for index in range(count):
-        out[index] = candidates[out[index]]
-
-
-# A 32-bit PCG RXS-M-XS (O'Neill 2014, HMC-CS-2014-0905) in 64-bit signed arithmetic that never
-# overflows, so that it means the same with and without compilation.
-
-
-@kernel
-def next_word(word: int) -> int:
-    """Return the generator's state after ``word``."""
-    return (word * 747796405 + 2891336453) & LOW_32_BITS
-
-
-@kernel
-def scramble(word: int) -> int:
-    """Return a permutation of 32 bits: the generator's output after ``word``."""
-    state: int = next_word(word)
-    state = (((state >> ((state >> 28) + 4)) ^ state) * 277803737) & LOW_32_BITS
-    return (state >> 22) ^ state

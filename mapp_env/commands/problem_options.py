@@ -9,9 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mapp_env.draws import draw_landmarks
 from mapp_env.grid import Grid
 from mapp_env.grids import generator_names, grid_names, make_grid
-from mapp_env.problem import MAX_LANDMARKS, Problem, draw_landmarks, sample_problems
+from mapp_env.problem import MAX_LANDMARKS, Problem, sample_problems
 from mapp_env.validation import check_count, describe
 
 MAX_DRAWN = 2**63 - 1  # largest seed of what is drawn

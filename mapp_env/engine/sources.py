@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
+from mapp_env.draws import draw_grid, draw_landmarks
 from mapp_env.engine.task import Task
-from mapp_env.problem import LOW_32_BITS, draw_landmarks, scramble
 
 OWN_LIMIT = -1  # of an episode that has the environment's step limit
 NO_GRIDS = np.zeros(0, np.int64)  # wanted: they are drawn
@@ -80,22 +80,3 @@ def _draw_rows(
         for agent in range(cells.shape[1]):
             cells[row, agent] = depots[grid]
         limits[row] = OWN_LIMIT
-
-
-@kernel
-def draw_grid(word: np.uint64, n_grids: int) -> int:
-    """Return one of ``n_grids`` numbers, each equally likely, by a random word (R10).
-
-    The word is scrambled as :func:`~mapp_env.problem.draw_landmarks` does it, which counts up from
-    0; here the count goes down from -1, so that the landmarks are what they are without a draw.
-    """
-    high = np.int64(word >> np.uint64(32))
-    low = np.int64(word & np.uint64(LOW_32_BITS))
-    used = 0
-    pick, multiple = 0, LOW_32_BITS
-    while multiple > LOW_32_BITS + 1 - n_grids:
-        used -= 1
-        bits = scramble(scramble((low + used * 0x9E3779B9) & LOW_32_BITS) ^ high)
-        pick = bits % n_grids
-        multiple = bits - pick
-    return int(pick)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapp_env.compiled import kernel
-from mapp_env.problem import next_word, scramble
+from mapp_env.draws import next_word, scramble
 from mapp_env.solvers.solution import UNBOUNDED
 
 PATIENCE = 5_000

@@ -20,6 +20,7 @@ BASELINES = sorted((REPOSITORY / "baselines").rglob("*.py"))
 LAYERS: tuple[str, ...] = (
     "mapp_env.validation",
     "mapp_env.compiled",
+    "mapp_env.draws",
     "mapp_env.files",
     "mapp_env.records",
     "mapp_env.map_format",
